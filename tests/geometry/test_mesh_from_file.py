@@ -50,8 +50,9 @@ def test_quads_become_two_triangles_in_place_and_keep_their_label(tmp_path):
     assert mesh.face_label.tolist() == [6, 6, 7, 7]
 
 
-def _polygons(path: Path, order: str, faces: list[list[int]]) -> bytes:
-    """A binary PLY of faces of several sizes, with texture coordinates and labels."""
+def _polygons(path: Path, order: str, faces: list[list[int]], *, corners_uv: bool = False) -> bytes:
+    """A binary PLY of faces of several sizes, with texture coordinates (of each, or of each of
+    its corners) and labels."""
     endian = "little" if order == "<" else "big"
     head = (
         f"ply\nformat binary_{endian}_endian 1.0\ncomment TextureFile a.png\n"
@@ -64,7 +65,8 @@ def _polygons(path: Path, order: str, faces: list[list[int]]) -> bytes:
     body = b"".join(struct.pack(f"{order}3dB", *point, 9) for point in points)
     for i, face in enumerate(faces):
         body += struct.pack(f"{order}B{len(face)}I", len(face), *face)
-        body += struct.pack(f"{order}B2fi", 2, 0.5, 0.5, 6 + i)
+        uv = [0, 0, i, 0.5, 0, 1] if corners_uv else [0.5, 0.5]
+        body += struct.pack(f"{order}B{len(uv)}fi", len(uv), *uv, 6 + i)
     path.write_bytes(head.encode() + body)
     return head.encode() + body
 
@@ -81,6 +83,28 @@ def test_binary_triangles_beside_quads_are_read(tmp_path, order):
     path.write_bytes(content[:-3])
     with pytest.raises(InputRefused, match=r"\[mesh\.read\]$"):
         mesh_from_file(path)
+
+
+@pytest.mark.parametrize("order", ["<", ">", "ascii"])
+def test_corners_with_texture_coordinates_part_no_vertices(tmp_path, order):
+    """As MeshLab writes them: triangles alone, each corner with its own place in the picture."""
+    path = tmp_path / "textured.ply"
+    faces = [[1, 4, 2], [0, 1, 2], [2, 1, 0]]
+    content = _polygons(path, "<" if order == "ascii" else order, faces, corners_uv=True)
+    if order == "ascii":
+        head = (
+            content[: content.index(b"end_header")].decode().replace("binary_little_endian", order)
+        )
+        rows = ["0 0 0 9", "1 0 0 9", "1 1 0 9", "0 1 0 9", "2 0 0 9"]
+        for i, face in enumerate(faces):
+            corners = " ".join(map(str, face))
+            rows.append(f"3 {corners} 6 0 0 {i} 0.5 0 1 {6 + i}")
+        path.write_text(head + "end_header\n" + "\n".join(rows) + "\n")
+    mesh = mesh_from_file(path)
+    assert mesh.triangles.tolist() == faces
+    assert mesh.points.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0]]
+    assert mesh.face_label is not None
+    assert mesh.face_label.tolist() == [6, 7, 8]
 
 
 def test_a_polygon_of_five_corners_is_named(tmp_path):

@@ -187,7 +187,8 @@ def _refuse_if_many(path: Path, broken: Bool, what: str, rule: str) -> None:
 
 def _mesh_from_ply(file: BinaryIO) -> FileMesh:
     try:
-        arrays: dict[str, Any] = load_ply(file)
+        # Where corners have texture coordinates trimesh would part vertices, and join others.
+        arrays: dict[str, Any] = load_ply(file, fix_texture=False)
     except ValueError:
         # Which is also what it says of triangles beside quads, if they are binary.
         points, triangles, numbers = binary_ply_of_polygons(file)
