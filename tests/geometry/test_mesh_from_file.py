@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from pathlib import Path
 
@@ -153,6 +154,72 @@ def test_glb_nodes_become_labels_in_world_positions(tmp_path):
     mesh = mesh_from_file(tmp_path / "scene.glb")
     assert sorted(mesh.label_names) == ["ball", "box"]
     np.testing.assert_allclose(mesh.points.max(axis=0), [4, 1, 1], atol=1e-6)
+
+
+def _quad_glb(path: Path, **changes: object) -> None:
+    """A square of two triangles; ``changes`` of its document, of the first entry of what is a
+    list."""
+    points = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    blob = points.tobytes() + np.uint32([0, 1, 2, 0, 2, 3]).tobytes()
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": 6, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 48},
+            {"buffer": 0, "byteOffset": 48, "byteLength": 24},
+        ],
+        "buffers": [{"byteLength": len(blob)}],
+    }
+    primitive = document["meshes"][0]["primitives"][0]
+    for key, change in changes.items():
+        if key == "primitive":
+            primitive.update(change)
+        elif isinstance(change, dict):
+            document[key][0].update(change)
+        else:
+            document[key] = change
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(blob), len(text), b"JSON")
+    path.write_bytes(head + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob)
+
+
+_DRACO = {"extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {}}}}
+_SPARSE = {"count": 1, "indices": {"bufferView": 1, "componentType": 5125}, "values": {}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"primitive": _DRACO, "accessors": [{"componentType": 5126, "count": 4, "type": "VEC3"},
+             {"componentType": 5125, "count": 6, "type": "SCALAR"}]},
+            "compressed (Draco)",
+        ),
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "compressed (meshopt)"),
+        ({"nodes": {"extensions": {"EXT_mesh_gpu_instancing": {}}}}, "copies of meshes"),
+        ({"accessors": {"sparse": _SPARSE}}, "sparse"),
+        ({"accessors": {"componentType": 5122, "normalized": True}}, "quantised"),
+        ({"primitive": {"mode": 6}}, "fans"),
+    ],
+)  # fmt: skip
+def test_glb_whose_geometry_would_be_another_is_refused(tmp_path, changes, words):
+    """trimesh would leave some of it out, or take zeros and whole numbers for places."""
+    path = tmp_path / "mesh.glb"
+    _quad_glb(path, primitive=_DRACO)  # beside vertices as they are
+    assert mesh_from_file(path).triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
+    _quad_glb(path, **changes)
+    for read in (mesh_from_file, model_from_file):
+        with pytest.raises(InputRefused, match=r"mesh\.glb: .*\[mesh\.format\]$") as refused:
+            read(path)
+        assert words in str(refused.value)
 
 
 @pytest.mark.fault("G2")

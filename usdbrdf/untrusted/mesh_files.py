@@ -34,6 +34,7 @@ from usdbrdf.model.material import (
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 from usdbrdf.untrusted.mesh_gltf import (
     emissive_strength,
+    geometry_not_read,
     is_clear,
     normal_reflectance_of,
     refuse_false,
@@ -220,9 +221,9 @@ def _mesh_from_obj(file: BinaryIO) -> FileMesh:
     return _joined([(name, p["vertices"], p["faces"]) for name, p in parts.items()])
 
 
-def _refuse_promises(file: BinaryIO) -> None:
-    """ValueError where a GLB announces more than it holds, for which room would be made before
-    anybody looks: longer parts, or elements without bytes, which are zeros."""
+def _refuse_promises(file: BinaryIO) -> dict[str, Any]:
+    """The document of a GLB. ValueError where it announces more than it holds, for which room would
+    be made before anybody looks: longer parts, or elements without bytes, which are zeros."""
     size = file.seek(0, os.SEEK_END)
     starts = [12]
     while starts[-1] + 8 <= size:
@@ -231,15 +232,20 @@ def _refuse_promises(file: BinaryIO) -> None:
     if starts[-1] > size:
         raise ValueError(f"a part ends {starts[-1] - size} bytes after the file")
     file.seek(20)
-    document = json.loads(file.read(starts[1] - 20)) if len(starts) > 1 else {}
+    document: dict[str, Any] = json.loads(file.read(starts[1] - 20)) if len(starts) > 1 else {}
     file.seek(0)
     promised = [int(a["count"]) for a in document.get("accessors", ()) if "bufferView" not in a]
     if sum(map(abs, promised)) > _MAX_ZEROS:
         raise ValueError(f"{sum(promised)} elements without bytes (limit {_MAX_ZEROS})")
+    return document
 
 
 def _mesh_from_glb(file: BinaryIO) -> FileMesh:
-    _refuse_promises(file)
+    if said := geometry_not_read(_refuse_promises(file)):
+        raise InputRefused(
+            f"{file.name}: {said}, which is not read here. Export it again as plain triangles, "
+            "without compression, or convert it to PLY. [mesh.format]"
+        )
     scene = trimesh.load_scene(file, file_type="glb", process=False)
     parts = []
     for node in sorted(scene.graph.nodes_geometry):

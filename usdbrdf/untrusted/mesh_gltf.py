@@ -1,4 +1,5 @@
-"""What trimesh does not keep of a GLB: its materials' extensions, its vertex colours as stored."""
+"""What trimesh does not keep of a GLB: its materials' extensions, its vertex colours as stored; and
+what geometry it passes over or takes for another."""
 
 from __future__ import annotations
 
@@ -26,6 +27,31 @@ _EXTENSIONS: dict[tuple[str, str], float | tuple[float, ...]] = {
     ("specular", "specularColorFactor"): (1.0, 1.0, 1.0),
     ("transmission", "transmissionFactor"): 0.0,
 }
+_DRACO, _INSTANCES = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
+_MESHOPT = frozenset(("EXT_meshopt_compression", "KHR_meshopt_compression"))
+_FLOAT, _FAN = 5126, 6
+
+
+def geometry_not_read(document: dict[str, Any]) -> str:
+    """What of a document's geometry would be left out, or stand elsewhere; "" where all is read."""
+    # Buffers that are there beside compressed ones are those that are read, unless it must be so.
+    if _MESHOPT & {*document.get("extensionsRequired", ())}:
+        return "its vertices are compressed (meshopt)"
+    if any(_INSTANCES in node.get("extensions", {}) for node in document.get("nodes", ())):
+        return f"it has copies of meshes ({_INSTANCES})"
+    accessors = document.get("accessors", ())
+    for primitive in (p for mesh in document.get("meshes", ()) for p in mesh["primitives"]):
+        points = primitive["attributes"].get("POSITION")
+        used = [accessors[i] for i in (points, primitive.get("indices")) if i is not None]
+        if _DRACO in primitive.get("extensions", {}) and any("bufferView" not in a for a in used):
+            return "its meshes are compressed (Draco)"
+        if any("sparse" in a for a in used):
+            return "it has sparse vertices or faces"
+        if any(a.get("normalized") and a["componentType"] != _FLOAT for a in used):
+            return "its vertices are quantised and normalised"
+        if primitive.get("mode") == _FAN:
+            return "it has fans of triangles"
+    return ""
 
 
 def with_numbered_materials(file: BinaryIO) -> tuple[BinaryIO, list[dict[str, Any]]]:
