@@ -419,6 +419,19 @@ def test_subsets_of_several_meshes_stay_with_their_mesh(tmp_path):
     assert names == ["part_of_a", "a", "a", "a", "b", "part_of_b", "part_of_b", "part_of_b"]
 
 
+@pytest.mark.fault("G8")
+def test_meshes_that_stand_where_single_precision_moves_them_are_refused(tmp_path):
+    stage = _stage(tmp_path / "a.usda")
+    _mesh(stage, "/scan/floor", [(0, 0, 0), (4, 0, 0), (4, 4, 0)], [3], [0, 1, 2])
+    stage.Save()
+    assert len(meshes_from_usd(tmp_path / "a.usda").mesh.triangles) == 1
+    place = UsdGeom.Xformable(stage.GetDefaultPrim()).AddTranslateOp()
+    place.Set(Gf.Vec3d(450_000, 5_400_000, 0))
+    stage.Save()
+    with pytest.raises(InputRefused, match=r"a\.usda: coordinates reach 5400004 .*\[mesh\.far\]$"):
+        meshes_from_usd(tmp_path / "a.usda")
+
+
 @pytest.mark.fault("S4")
 def test_text_that_is_not_utf_8_ends_in_a_sentence(tmp_path):
     """USD hands bytes on as they are, also in what it says of them."""

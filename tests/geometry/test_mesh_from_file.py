@@ -262,6 +262,21 @@ def test_unusable_files_are_refused_in_one_sentence(tmp_path, name, content, rul
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.fault("G8")
+def test_georeferenced_points_that_single_precision_would_move_are_refused(tmp_path):
+    """At 600 km steps are of 6 cm; in a mesh of 4 km they say nothing."""
+    for size, place, refused in ((4, 0, False), (4, 6e5, True), (4000, 6e5, False)):
+        x, y = place, place / 3
+        corners = [(x, y), (x + size, y), (x + size, y + size)]
+        rows = "".join(f"v {p:.3f} {q:.3f} 400\n" for p, q in corners)
+        (tmp_path / "mesh.obj").write_text(rows + "f 1 2 3\n")
+        if refused:
+            with pytest.raises(InputRefused, match=r"one offset .*\[mesh\.far\]$"):
+                mesh_from_file(tmp_path / "mesh.obj")
+        else:
+            assert len(mesh_from_file(tmp_path / "mesh.obj").triangles) == 1
+
+
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
 def test_truncated_files_are_refused(tmp_path, share):
     points, triangles, face_object, _ = room_mesh()

@@ -16,9 +16,12 @@ import numpy as np
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.job.child import run_child
 from usdbrdf.job.memory import addresses_of_libraries, machine_bytes
-from usdbrdf.model.arrays import Array
+from usdbrdf.model.arrays import Array, Double, Float
 
 _GIB = 1 << 30
+# Of a mesh's diagonal, between neighbouring single-precision coordinates: half a pixel where a
+# picture of a thousand shows all of it.
+_MAX_STEP = 5e-4
 
 
 class Limits(NamedTuple):
@@ -107,6 +110,20 @@ def import_here(arrays: Mapping[str, Array], announced: Mapping[str, str]) -> di
     except (Exception, SystemExit) as error:
         raise InputRefused(f"{type(error).__name__}: {error}. [adapter.load]") from error
     return {}
+
+
+def refuse_far(path: Path, points: Float | Double) -> None:
+    """InputRefused where points (N, 3) of a mesh lie so far from the origin, as georeferenced ones
+    do, that single precision, which USD's points have and rays are traced in, moves them."""
+    far = float(np.abs(points).max())
+    across = float(np.linalg.norm(np.ptp(points.astype(np.float64), axis=0)))
+    step = float(np.spacing(np.float32(far)))
+    if step > _MAX_STEP * across > 0:
+        raise InputRefused(
+            f"{path}: coordinates reach {far:.9g} in a mesh that is {across:.3g} across, so that "
+            f"single precision moves its points by up to {step / 2:.2g}. Export mesh and cameras "
+            "with one offset that brings both to the origin. [mesh.far]"
+        )
 
 
 def refuse_large(kind: str, path: Path) -> None:

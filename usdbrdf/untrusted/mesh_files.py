@@ -31,7 +31,7 @@ from usdbrdf.model.material import (
     preview_material,
     with_corner_colours,
 )
-from usdbrdf.untrusted.bounds import read_in_child, refuse_large
+from usdbrdf.untrusted.bounds import read_in_child, refuse_far, refuse_large
 from usdbrdf.untrusted.mesh_gltf import (
     emissive_strength,
     geometry_not_read,
@@ -167,6 +167,7 @@ def checked_mesh(mesh: FileMesh, path: Path) -> FileMesh:
             f"{path}: the whole mesh is {diagonal:.3g} across (limit {_MIN_DIAGONAL:g}). "
             "Check its unit. [mesh.tiny]"
         )
+    refuse_far(path, used)
     return replace(
         mesh,
         # Vertices of no face keep their place, but no NaN may travel on.

@@ -26,7 +26,7 @@ from usdbrdf.model.mesh import (
     joined,
     triangulate,
 )
-from usdbrdf.untrusted.bounds import read_in_child
+from usdbrdf.untrusted.bounds import read_in_child, refuse_far
 from usdbrdf.untrusted.usd_paths import check_asset_paths, one_line, refuse_unchecked, usd_errors
 
 # What fills the sky or lies below an atom is no scan's unit.
@@ -115,6 +115,7 @@ def _meshes(stage: Usd.Stage, path: Path, *, subsets: bool) -> ScanGeometry:
         for mesh in meshes
     ]
     points, triangles, face_object = joined([part[:2] for part in parts])
+    refuse_far(path, points)
     owner_of_face = []
     prims = [mesh.GetPrim() for mesh in meshes]
     split = [face_subsets(mesh) if subsets else [] for mesh in meshes]
