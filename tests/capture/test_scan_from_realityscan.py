@@ -60,6 +60,16 @@ def test_cameras_of_the_table(tmp_path, room, header, separator):
     assert (scan.adapter, scan.up_axis) == ("realityscan", "Z")
 
 
+def test_a_table_that_a_spreadsheet_has_saved(tmp_path, room):
+    folder = write_table(write_pictures(tmp_path / "scan", room), room)
+    table = folder / "registration.csv"
+    rows = table.read_text().splitlines()[1:]
+    table.unlink()
+    (folder / "Registration.CSV").write_bytes("\r\n".join(rows).encode("utf-8-sig"))
+    assert choose_adapter(folder).name == "realityscan"
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+
+
 def test_radiance_beside_the_pictures_is_taken_with_their_masks(tmp_path, room):
     folder = write_table(write_pictures(tmp_path / "scan", room), room)
     for i, image in enumerate(room.images):
@@ -104,6 +114,23 @@ def test_sidecars_lie_beside_their_pictures_in_any_folder_of_these(tmp_path, roo
     order = [0, 2, 4, 6, 1, 3, 5, 7, 9]
     assert_same(scan, room, poses=room.world_from_camera[order], names=room.names)
     assert [s for s in scan.warnings if "'rig/0/IMG_4': no picture" in s]
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_sidecars_may_hold_what_other_programs_say(tmp_path, room, first):
+    """As Lightroom and ExifTool write it: a description for each of them."""
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)
+    ours = "<rdf:Description xcr:"
+    other = (
+        '<rdf:Description rdf:about="" xmlns:crs="http://ns.adobe.com/camera-raw-settings/1.0/" '
+        f'crs:Rotation="90"><crs:Position>1 2 3</crs:Position>{3000 * " "}</rdf:Description>'
+    )
+    for path in folder.glob("images/*.xmp"):
+        text = path.read_text()
+        changed = text.replace(ours, other + ours) if first else text.replace("</rdf:RDF>", other)
+        path.write_text(changed if first else changed.replace(other, other + "</rdf:RDF>"))
+    assert choose_adapter(folder).name == "realityscan"
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
 
 
 def write_sidecars(folder, room, *, as_attributes):

@@ -56,12 +56,13 @@ def matches(path: Path) -> bool:
 
 
 def _tables(path: Path) -> list[Path]:
-    files = [path] if path.is_file() else sorted(path.glob("*.csv")) if path.is_dir() else []
+    files = [path] if path.is_file() else sorted(path.iterdir()) if path.is_dir() else []
     return [file for file in files if file.suffix.lower() == ".csv" and _is_table(file)]
 
 
 def _is_table(file: Path) -> bool:
-    lines = beginning_of(file).decode("utf-8", "replace").lower().splitlines()
+    # What a spreadsheet has saved begins with a mark of UTF-8.
+    lines = beginning_of(file).decode("utf-8-sig", "replace").lower().splitlines()
     first = next((line for line in lines if re.search("[,;]", line)), "")
     return {"name", "x", "y", "alt"} <= {word.strip(" #") for word in re.split("[,;]", first)}
 
@@ -75,7 +76,8 @@ def _sidecars(path: Path) -> list[Path]:
 
 
 def _is_sidecar(file: Path) -> bool:
-    return b"capturingreality.com/ns/xcr" in beginning_of(file)
+    # Other programs may have written before it.
+    return b"capturingreality.com/ns/xcr" in beginning_of(file, 1 << 16)
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:
@@ -150,8 +152,7 @@ def records_of_sidecars(
     all_files = set(files)
     for file in files:
         name, image = _name_and_picture(file, all_files, pictures)
-        described = read_xml(file).find(f".//{_DESCRIBED}")
-        said = _sidecar_values(described) if described is not None else {}
+        said = _sidecar_values(read_xml(file))
         rotation, place = _numbers(said, "Rotation", 9), _numbers(said, "Position", 3)
         focal = number_in(said, "FocalLength35mm")
         model = said.get("DistortionModel", "perspective")
@@ -191,10 +192,14 @@ def _name_and_picture(
     return name, image if own == file or own not in all_files else None
 
 
-def _sidecar_values(described: Element) -> dict[str, str]:
-    """What an XMP says, as attributes or as elements."""
-    values = {k.removeprefix(_NAMESPACE): v for k, v in described.attrib.items()}
-    return values | {c.tag.removeprefix(_NAMESPACE): c.text or "" for c in described}
+def _sidecar_values(root: Element) -> dict[str, str]:
+    """What an XMP says, as attributes or as elements. What other programs have added stands in
+    descriptions of its own, before or after."""
+    values: dict[str, str] = {}
+    for described in root.iterfind(f".//{_DESCRIBED}"):
+        values |= {k.removeprefix(_NAMESPACE): v for k, v in described.attrib.items()}
+        values |= {c.tag.removeprefix(_NAMESPACE): c.text or "" for c in described}
+    return values
 
 
 def _numbers(said: Mapping[str, str], key: str, count: int) -> Double | None:
