@@ -115,6 +115,12 @@ def test_cameras_of_a_chunk(project, room):
     assert (scan.adapter, scan.up_axis, scan.meters_per_unit) == ("metashape", "Z", 1.0)
 
 
+def test_an_export_may_be_called_in_capitals(project, room):
+    (project / "cameras.xml").rename(project / "CAMERAS.XML")
+    assert choose_adapter(project).name == "metashape"
+    assert_same(read_scan(project, OPTIONS), room, names=room.names)
+
+
 def test_of_a_rig_only_the_master_has_a_transform(tmp_path, room):
     """Two cameras on one rig, at five places; the transform is the component's."""
     document, sensors, cameras = _chunk(component=True)

@@ -15,9 +15,8 @@ DESCRIPTION = DESCRIPTIONS[NAME]
 
 def matches(path: Path) -> bool:
     """An Alembic file, or a folder with one."""
-    if path.is_dir():
-        return any(path.glob("*.abc"))
-    return path.suffix.lower() == ".abc" and path.is_file()
+    files = path.iterdir() if path.is_dir() else (path,)
+    return any(file.suffix.lower() == ".abc" and file.is_file() for file in files)
 
 
 def read(path: Path, options: CaptureOptions) -> NoReturn:

@@ -40,7 +40,7 @@ def matches(path: Path) -> bool:
 
 
 def _file_of(path: Path) -> Path | None:
-    files = sorted(path.glob("*.e57")) if path.is_dir() else [path]
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
     files = [file for file in files if file.suffix.lower() == ".e57" and file.is_file()]
     return files[0] if len(files) == 1 else None
 

@@ -51,7 +51,7 @@ def matches(path: Path) -> bool:
 
 
 def _documents(path: Path) -> list[Path]:
-    files = sorted(path.glob("*.xml")) if path.is_dir() else [path]
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
     heads = ((file, beginning_of(file)) for file in files if file.suffix.lower() == ".xml")
     return [file for file, head in heads if b"<chunk" in head and b"<sensors" in head]
 
