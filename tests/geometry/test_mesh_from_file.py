@@ -129,6 +129,24 @@ def test_obj_may_count_its_vertices_back_from_where_a_face_stands(tmp_path):
     assert np.concatenate(shown).tolist() == [[0, 0, 0], [5, 5, 5]]
 
 
+@pytest.mark.parametrize(
+    "written",
+    [
+        lambda text: "\ufeff" + text,
+        lambda text: text.replace(" ", "\t"),
+        lambda text: text.replace(" ", "  ").replace("\n", " \r\n"),
+        lambda text: text.replace("\n", " # of mine\n"),
+        lambda text: f"o seat #1\n{text}\n# 4 vertices, 2 faces",
+    ],
+)
+def test_obj_may_be_written_in_other_ways(tmp_path, written):
+    text = f"{_SQUARE}v 9 9 9\nf 1 2 3\nf 1 3 4\n"
+    (tmp_path / "mesh.obj").write_text(written(text), newline="")
+    mesh = mesh_from_file(tmp_path / "mesh.obj")
+    assert mesh.points[:4].tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
 @pytest.mark.parametrize("face", ["f 0 1 2", "f 1/1 2/1 0/1", "f -1 -2 -5"])
 def test_obj_faces_with_vertices_before_the_first_are_refused(tmp_path, face):
     (tmp_path / "from_0.obj").write_text(_SQUARE + face + "\n")

@@ -1,8 +1,9 @@
 """What trimesh makes something else of than PLY and OBJ files say: polygons of several sizes in a
-binary PLY, and vertices that an OBJ counts backwards."""
+binary PLY, and vertices that an OBJ counts backwards or writes in other ways than most."""
 
 from __future__ import annotations
 
+import codecs
 import re
 import struct
 from io import BytesIO
@@ -12,6 +13,7 @@ import numpy as np
 
 _BACKWARDS = re.compile(rb"^[ \t]*f[ \t][^\n]*[ \t]-\d", re.MULTILINE)
 _NOUGHT = re.compile(rb"^[ \t]*f[ \t](?:[^\n]*[ \t])?0+[/ \t\r\n]", re.MULTILINE)
+_REMARK = re.compile(rb"^([ ]*(?:v[tn]?|f) [^\n#]*)#[^\n]*", re.MULTILINE)
 # PLY's names of numbers, as struct spells them.
 _KINDS = {
     "char": "b", "int8": "b", "uchar": "B", "uint8": "B", "short": "h", "int16": "h",
@@ -23,11 +25,14 @@ _LONGEST_HEADER = 1 << 16
 
 def obj_counted_forwards(file: BinaryIO) -> BinaryIO:
     """An OBJ all of whose faces count vertices from the first one on. Its format lets them count
-    back from where they stand; trimesh would count from the end of the file.
+    back from where they stand; trimesh would count from the end of the file. It would also pass
+    over lines whose words tabs part, or that a mark of UTF-8 begins, and stumble over remarks.
 
     Raises ValueError for a vertex 0, which would be taken for the last one.
     """
-    content = file.read()
+    content = file.read().removeprefix(codecs.BOM_UTF8).replace(b"\t", b" ")
+    if b" #" in content:
+        content = _REMARK.sub(rb"\1", content)
     if _NOUGHT.search(content):
         raise ValueError("a face has a vertex 0, but OBJ counts from 1")
     if not _BACKWARDS.search(content):
