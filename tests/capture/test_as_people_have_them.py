@@ -13,7 +13,7 @@ import pytest
 
 from tests.scenes import MadeCapture, edited, make_capture, write_ply
 from usdbrdf.capture.adapters import read_scan
-from usdbrdf.capture.formats.named_pictures import Pictures
+from usdbrdf.capture.formats.named_pictures import Pictures, pictures_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import read_exr, white_of_mask
@@ -127,6 +127,8 @@ def test_names_of_colmaps_images_may_hold_anything(made, kind):
         ("frames/{:04d}.CR2", "", True),
         ("frames/{:04d}.HEIC", "", True),
         ("frames/{:04d}.nef", "frames/{:04d}.NEF.exr", True),
+        ("K\u00fcche/{:04d} \u00f1.exr", "Ku\u0308che/{:04d} n\u0303.exr", False),
+        ("Frames/{:04d}.exr", "", False),
     ],
 )
 def test_frames_are_found_by_other_spellings_of_their_names(made, name, files, told):
@@ -134,6 +136,28 @@ def test_frames_are_found_by_other_spellings_of_their_names(made, name, files, t
     scan = _read(made)
     np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera)
     assert any("[capture.file]" in sentence for sentence in scan.warnings) == told
+
+
+def test_folders_of_other_spellings_are_no_links_and_not_two(made, tmp_path):
+    _rename(made, "Frames/{:04d}.exr")
+    (made.folder / "FRAMES").mkdir()
+    with pytest.raises(InputRefused, match=r"does not exist.*\[capture\.file\]$"):
+        _read(made)
+    (made.folder / "FRAMES").rmdir()
+    (made.folder / "frames").rename(tmp_path / "elsewhere")
+    (made.folder / "frames").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputRefused, match=r"does not exist.*\[capture\.file\]$"):
+        _read(made)
+
+
+def test_accents_that_macos_takes_apart_are_the_same(tmp_path):
+    """Names by their stem alone, as cameras of Metashape and RealityScan have them."""
+    for name in ("Ku\u0308che.jpg", "Bad.jpg"):
+        _write_bytes(tmp_path / "images" / name, np.zeros((2, 2, 3), np.uint8))
+    pictures = pictures_of(tmp_path, IngestOptions())
+    found = pictures.named("K\u00fcche.jpg")
+    assert found == tmp_path / "images" / "Ku\u0308che.jpg"
+    assert pictures.mask_of(found, tmp_path, IngestOptions()) is None
 
 
 @pytest.mark.parametrize("place", ["/home/me/scan/", "C:\\Users\\me\\scan\\", "../fox/"])

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -89,7 +90,7 @@ class Pictures:
         """The picture of this name: by its path below the folder, else by the end of its path, else
         by its name alone, each with its suffix or another; of a photograph with radiance beside
         it that; None where there is none or several."""
-        wanted = PurePosixPath(label.replace("\\", "/").lstrip("./"))
+        wanted = PurePosixPath(_composed(label).replace("\\", "/").lstrip("./"))
         known = [name for name in _names_without_suffix(wanted.name) if name in self._by_stem]
         if not known:
             return None
@@ -129,7 +130,7 @@ class Pictures:
     def mask_of(self, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
         """``mask_beside`` of a picture, or of another of its name beside it, by its path below the
         pictures' folder, else by its name alone, where no other folder has a picture of it."""
-        alike = [path for path, _ in self._by_stem[picture.stem]]
+        alike = [path for path, _ in self._by_stem[_composed(picture.stem)]]
         beside = [path for path in alike if path.parent == picture.parent]
         names = [path.relative_to(self.folder).as_posix() for path in beside]
         if len(beside) == len(alike):
@@ -141,8 +142,8 @@ class Pictures:
     def _by_stem(self) -> dict[str, list[tuple[Path, PurePosixPath]]]:
         by_stem: dict[str, list[tuple[Path, PurePosixPath]]] = {}
         for path in self.paths:
-            relative = PurePosixPath(path.relative_to(self.folder).as_posix())
-            by_stem.setdefault(path.stem, []).append((path, relative))
+            relative = PurePosixPath(_composed(path.relative_to(self.folder).as_posix()))
+            by_stem.setdefault(relative.stem, []).append((path, relative))
         return by_stem
 
     def numbered(self) -> dict[int, Path]:
@@ -153,6 +154,12 @@ class Pictures:
             if digits := re.search(r"(\d+)$", path.stem):
                 found.setdefault(int(digits.group(1)), []).insert(0, path)
         return {i: min(_in_colours(alike), key=_nearness) for i, alike in found.items()}
+
+
+def _composed(name: str) -> str:
+    """A name with its accents as most programs write them; macOS hands them on as letters of their
+    own, which only look the same."""
+    return unicodedata.normalize("NFC", name)
 
 
 def _nearness(path: Path) -> int:
@@ -249,7 +256,7 @@ class Pictured:
 
     def of(self, name: str, below: str = "") -> Path | None:
         """The picture called ``name`` in the folder ``below``: the file of this name, else the one
-        beside it whose name differs in nothing but case and kind of picture, radiance first; of a
+        there whose name differs in nothing but case and kind of picture, radiance first; of a
         photograph that is there too, the radiance beside it, of HEIF any. Of ``--frames``, the
         picture there that has its name. None where there is none. InputRefused for what leads out.
         """
@@ -261,7 +268,7 @@ class Pictured:
             whole = whole.replace("\\", "/")
             path = path_in_capture(self.folder, whole, self.options, cure=_OTHER_FOLDER)
         beside = self._in_folder(path.parent)
-        names = _names_without_suffix(path.name.lower())
+        names = _names_without_suffix(_composed(path.name).lower())
         alike = next((beside[stem] for stem in names if stem in beside), [])
         if path.is_file() and not (alike and path.suffix.lower() in _HEIF):
             return _or_radiance(path, alike, self.instead)
@@ -270,7 +277,7 @@ class Pictured:
             # Where some are of the kind that is named, what is of another may be their depths.
             alike = [one for one in alike if one.suffix.lower() == suffix or _is_radiance(one)]
         nearest = nearest_to_radiance(alike)
-        if nearest and path.name not in (nearest.name, nearest.stem):
+        if nearest and _composed(path.name) not in map(_composed, (nearest.name, nearest.stem)):
             self.otherwise[name] = nearest
         return nearest
 
@@ -293,9 +300,20 @@ class Pictured:
     def _in_folder(self, folder: Path) -> dict[str, list[Path]]:
         if folder not in self._listed:
             of_stem = self._listed[folder] = {}
-            for path in _below(folder, deep=False).paths if folder.is_dir() else ():
-                of_stem.setdefault(path.stem.lower(), []).append(path)
+            place = self._folder_called(folder)
+            for path in _below(place, deep=False).paths if place.is_dir() else ():
+                of_stem.setdefault(_composed(path.stem).lower(), []).append(path)
         return self._listed[folder]
+
+    def _folder_called(self, folder: Path) -> Path:
+        """A folder of the capture, else the only one there whose name differs in case alone."""
+        if folder.is_dir() or not folder.is_relative_to(self.folder):
+            return folder
+        above, name = self._folder_called(folder.parent), _composed(folder.name).lower()
+        there = above.iterdir() if above.is_dir() else ()
+        # No links: they may lead out.
+        alike = [p for p in there if _composed(p.name).lower() == name and not p.is_symlink()]
+        return alike[0] if len(alike) == 1 and alike[0].is_dir() else folder
 
 
 def _names_without_suffix(name: str) -> tuple[str, ...]:
