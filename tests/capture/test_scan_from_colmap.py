@@ -11,8 +11,10 @@ import pytest
 from tests.lens_scenes import CAMERAS, camera_of, capture_through, seen_through
 from tests.scenes import edited, make_capture, write_ply
 from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.checks import FrameRecord
 from usdbrdf.capture.formats import colmap
 from usdbrdf.capture.formats.named_pictures import mask_beside
+from usdbrdf.capture.up_axis import up_axis_of
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.options import IngestOptions
@@ -101,6 +103,36 @@ def test_text_models_of_other_programs_lose_no_image(tmp_path, written):
     np.testing.assert_allclose(
         scan.frames.world_from_camera, made.world_from_camera[order], atol=1e-12
     )
+
+
+def test_quaternions_need_no_length_of_1_but_some(tmp_path):
+    """As other programs round or scale them; of an image that was not placed it is 0, which says
+    nothing of what is up in the others."""
+    made = colmap_capture(tmp_path / "room", "PINHOLE", text=True)
+    file = made.folder / "sparse/0/images.txt"
+    for newer in ("rigs.txt", "frames.txt"):
+        file.with_name(newer).unlink()
+    rows = []
+    for row in file.read_text().splitlines():
+        words = row.split()
+        if row[:1] != "#" and len(words) == 10:
+            factor = 0 if words[9] == "0003.exr" else int(words[0])
+            words[1:5] = [str(factor * float(word)) for word in words[1:5]]
+        rows.append(" ".join(words))
+    file.write_text("\n".join(rows) + "\n")
+    scan = read_scan(made.folder, OPTIONS)
+    kept = np.delete(made.world_from_camera, 3, axis=0)
+    np.testing.assert_allclose(scan.frames.world_from_camera, kept, atol=1e-9)
+    assert any("'0003.exr': its pose is not a finite" in s for s in scan.warnings)
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # z up becomes y up
+    poses = [np.full((4, 4), np.nan), *made.world_from_camera.copy()]
+    for pose in poses[1:]:
+        pose[:3] = turn @ pose[:3]
+    record = FrameRecord(
+        name="", image_path=file, world_from_camera=poses[0], intrinsics=(1, 1, 1, 1),
+        resolution=(2, 2),
+    )  # fmt: skip
+    assert up_axis_of([replace(record, world_from_camera=pose) for pose in poses]) == "Y"
 
 
 def test_every_model_becomes_the_lens_that_pycolmap_has():

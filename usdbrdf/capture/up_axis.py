@@ -22,7 +22,7 @@ _NEARLY_UP, _BY_CHANCE = math.cos(math.radians(30)), 11.3
 def up_axis_of(records: Sequence[FrameRecord]) -> Literal["Y", "Z"]:
     """The up axis where a format does not say: z, unless people held their cameras clearly upright
     along y."""
-    up = np.nan_to_num(_ups(records).sum(axis=0))
+    up = np.nan_to_num(_ups(records), posinf=0, neginf=0).sum(axis=0)
     middle, most = np.argsort(np.abs(up)).tolist()[1:]
     clearly = most == 1 and up[1] > _CLEARLY * abs(up[middle])
     return "Y" if clearly else "Z"

@@ -8,7 +8,7 @@ import struct
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -92,7 +92,7 @@ def read_here(images: Path) -> ColmapModel:
                 (image for image in model.images.values() if image.has_pose), key=lambda i: i.name
             )
             names = _whole_names(images, {i.image_id: str(i.name) for i in found})
-            poses = [image.cam_from_world().matrix() for image in found]
+            poses = [_camera_from_world(image.cam_from_world()) for image in found]
         # COLMAP says what it stumbles over in its own terms, by exceptions of several kinds.
         except Exception as error:
             said = " ".join(str(error).split()).replace(str(scratch), str(folder))[:200]
@@ -114,6 +114,15 @@ def read_here(images: Path) -> ColmapModel:
         camera_from_world=np.array(poses, np.float64).reshape(-1, 3, 4),
         cameras=cameras,
     )
+
+
+def _camera_from_world(pose: Any) -> Double:
+    """(3, 4); a quaternion of any length is the rotation of its direction, one of 0 none: NaN."""
+    length = np.linalg.norm(pose.rotation.quat)
+    if not length > 0:
+        return np.full((3, 4), np.nan)
+    pose.rotation.normalize()
+    return np.asarray(pose.matrix(), np.float64)
 
 
 def _write_plain(file: Path, copy: Path) -> None:
