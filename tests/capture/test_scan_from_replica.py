@@ -133,6 +133,16 @@ def test_the_other_frames_keep_their_poses(scene, room):
     assert_same(scan, room, poses=np.delete(room.world_from_camera, [0, 6], axis=0))
 
 
+@pytest.mark.parametrize("word", ["nan", "-inf"])
+def test_a_pose_that_is_not_finite_costs_its_frame_alone(scene, room, word):
+    first, *others = (scene / "traj.txt").read_text().splitlines()
+    lost = " ".join([word, *first.split()[1:]])
+    (scene / "traj.txt").write_text("\n".join([lost, *others]) + "\n")
+    scan = read_scan(scene, OPTIONS)
+    assert_same(scan, room, poses=room.world_from_camera[1:])
+    assert any("its pose is not a finite" in sentence for sentence in scan.warnings)
+
+
 def test_labels_come_by_the_nearest_face_and_panes_are_objects(scene, room):
     write_ply(scene / "mesh.ply", room.points, room.triangles)
     write_semantics(scene, room)

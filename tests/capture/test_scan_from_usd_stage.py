@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSemantics, Vt
@@ -86,6 +88,20 @@ def test_many_cameras_find_their_pictures_by_name(tmp_path, room):
     assert_same(scan, room, points=room.points * 100, poses=poses, names=room.names)
     assert (scan.adapter, scan.up_axis, round(scan.meters_per_unit, 9)) == ("usd", "Z", 0.01)
     assert scan.usd_geometry == tmp_path / "shot" / "room.usda"
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+def test_a_camera_without_a_finite_place_costs_its_picture_alone(tmp_path, room, number):
+    stage = make_stage(tmp_path / "room.usda", room)
+    many_cameras(stage, room)
+    (place,) = UsdGeom.Camera(stage.GetPrimAtPath("/shots/IMG_003")).GetOrderedXformOps()
+    place.Set(Gf.Matrix4d(*[number] * 16))
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "images" / f"IMG-{i:03d}.exr", image)
+    scan = read_scan(tmp_path / "room.usda", IngestOptions())
+    assert_same(scan, room, poses=np.delete(room.world_from_camera, 3, axis=0), names=room.names)
+    assert any("IMG_003': its pose is not a finite" in sentence for sentence in scan.warnings)
 
 
 def test_cameras_find_their_pictures_by_the_prims_above(tmp_path, room):

@@ -17,7 +17,8 @@ OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0
 
 def opengl_from_opencv(world_from_camera: Double) -> Double:
     """(..., 4, 4) poses of cameras that look down +z with y down, as our cameras stand."""
-    return np.asarray(world_from_camera @ _FLIP, np.float64)
+    # Not a product of matrices: of an infinite number that would make others NaN, with a warning.
+    return np.asarray(world_from_camera * np.diag(_FLIP), np.float64)
 
 
 def _transposed(pose: Double) -> Double:

@@ -220,7 +220,7 @@ def _record(shot: _Shot, image: Path, findings: Findings) -> Iterator[FrameRecor
         return
     pose, exposure = shot.camera.world_from_camera[shot.i], float(shot.camera.exposure[shot.i])
     # What a camera hangs on may scale it, which changes where it stands and not what it sees.
-    size = np.cbrt(abs(np.linalg.det(pose[:3, :3])))
+    size = np.cbrt(abs(np.linalg.det(pose[:3, :3]))) if np.isfinite(pose).all() else 0
     if size > 0:
         pose = pose @ np.diag([1 / size, 1 / size, 1 / size, 1])
     yield FrameRecord(
