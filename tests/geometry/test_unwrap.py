@@ -25,7 +25,9 @@ from usdbrdf.geometry.unwrap import (
     beside_neighbours,
     pack_triangles_singly,
     parts_of,
+    stretched_share,
     unwrap,
+    without_noise,
 )
 from usdbrdf.model.scene import Scene, SceneObject
 
@@ -192,18 +194,55 @@ def test_charts_of_many_triangles_are_made_by_parts():
         assert atlas_side(uv, scene.points[triangles], 0.0113) is not None
 
 
-def test_parts_hold_every_triangle_once(monkeypatch):
-    monkeypatch.setattr(module, "_WHOLE", 100)
-    monkeypatch.setattr(module, "_FACES_OF_PART", 30)
+@pytest.mark.parametrize(("texels", "most"), [(1e9, 32), (1000 * 50, 50), (1, 100)])
+def test_parts_hold_every_triangle_once(monkeypatch, texels, most):
+    monkeypatch.setattr(module, "_FACES_OF_PART", (32, 100))
+    monkeypatch.setattr(module, "_TEXELS_OF_PART", 50 * 50)
     centres = np.random.default_rng(12345).random((1000, 3)).astype(np.float32)
-    parts = parts_of(centres)
+    parts = parts_of(centres, texels)
     assert sorted(np.concatenate(parts)) == list(range(1000))
-    assert max(map(len, parts)) <= 30
-    assert min(map(len, parts)) >= 14
+    assert most / 2 - 1 < min(map(len, parts)) <= max(map(len, parts)) <= most
     # Near each other: within a box of about the share of the volume that their number is.
     extents = np.array([np.ptp(centres[part], axis=0) for part in parts])
-    assert extents.prod(axis=1).mean() < 2 * 30 / 1000
-    assert len(parts_of(centres[:100])) == 1
+    assert extents.prod(axis=1).mean() < 2 * most / 1000
+
+
+def test_charts_of_a_scan_with_noise_are_those_of_its_surface():
+    """Noise bends triangles by tens of degrees, so that without smoothing few make a chart, and
+    most of the atlas lies between charts."""
+    x, y = np.meshgrid(np.arange(110), np.arange(110), indexing="ij")
+    flat = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) * 0.01
+    points = flat + np.random.default_rng(12345).normal(0, 0.0025, flat.shape)
+    first = (np.arange(109)[:, None] * 110 + np.arange(109)).reshape(-1, 1)
+    triangles = np.concatenate(
+        [first + np.array(ends) for ends in ((0, 110, 111), (0, 111, 1))]
+    ).astype(np.int32)
+    scene = _of_one_object(points.astype(np.float32), triangles)
+    uv, resolution = unwrap(scene, TexelSizes.even(scene, 0.004))
+    area = np.linalg.norm(np.cross(*np.moveaxis(np.diff(points[triangles], axis=1), 1, 0)), axis=1)
+    texels = area.sum() / 2 / 0.004**2
+    assert resolution.prod() < 2 * texels  # 5 times as many without
+    corners, side = scene.points[triangles], np.full(len(triangles), 0.004, np.float32)
+    assert stretched_share(uv * np.float32(resolution[0]), corners, side) < 0.05
+
+
+def test_smoothing_leaves_a_surface_as_large_as_it_was():
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    noise = np.random.default_rng(12345).normal(0, 0.005, ball.vertices.shape)
+    points, triangles = (ball.vertices + noise).astype(np.float32), np.int32(ball.faces)
+
+    def roughness(of):
+        return np.linalg.norm(of, axis=1).std()
+
+    smooth = without_noise(points, triangles, 4)
+    assert roughness(smooth) < roughness(points) / 2
+    assert np.linalg.norm(smooth, axis=1).mean() == pytest.approx(1, abs=0.002)
+    # Without noise nothing moves, nor where there is but one triangle.
+    flat = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    assert without_noise(flat, np.int32([[0, 1, 2]]), 2).shape == flat.shape
+    np.testing.assert_allclose(
+        without_noise(np.float32(ball.vertices), triangles, 4), ball.vertices, atol=5e-3
+    )
 
 
 def _of_one_object(points: np.ndarray, triangles: np.ndarray) -> Scene:

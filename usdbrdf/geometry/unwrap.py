@@ -31,9 +31,13 @@ MAX_SIDE = 16384
 # or the atlas would tell of the machine's speed: 80,000 triangles of a surface with noise take 10 s
 # on a slow one. And how many times that of wall time, where others are at work.
 _SECONDS, _SECONDS_OF_FACE, _BUSY = 600.0, 5e-3, 10
-# An object with more triangles gets its charts by parts of at most so many: on surfaces with noise
-# xatlas' time grows with the square of their number, and on smooth closed ones it crashes.
-_WHOLE, _FACES_OF_PART = 20_000, 2000
+# An object with more triangles gets its charts by parts: on surfaces with noise xatlas' time grows
+# with the square of their number, and on smooth closed ones it crashes. A part has so many
+# triangles, few where these are large: it is to be no smaller than so many texels.
+_WHOLE, _FACES_OF_PART, _TEXELS_OF_PART = 20_000, (2000, 8000), 64**2
+# Their charts are those of the surface without its noise, which would end them: after so many steps
+# of smoothing, more where triangles are smaller than texels.
+_STEPS = 2, 32
 # Children at work: each holds all the geometry. Of an object in one part xatlas takes one core.
 _AT_ONCE = min(4, os.cpu_count() or 1)
 # Triangles for which another one starts: it takes most of a second to import what it needs.
@@ -62,11 +66,8 @@ def atlas_side(corner_uv: Float, corners: Float, texel_size: float) -> int | Non
     side = math.ceil(math.sqrt(area.sum() / flat_area[shown].sum()) / texel_size)
     if side > MAX_SIDE:
         return None
-    # Metres along the surface per unit of the coordinates, the longest and the shortest.
-    metres = np.linalg.svd(np.linalg.inv(flat[shown]) @ edges[shown], compute_uv=False)
-    stretch = metres / (side * texel_size)
-    odd = ((stretch > _MAX_STRETCH) | (stretch < 1 / _MAX_STRETCH)).any(axis=1)
-    if area[shown][odd].sum() > _MAX_SHARE * area.sum():
+    sides = np.full(len(corners), texel_size, np.float32)
+    if stretched_share(corner_uv * np.float32(side), corners, sides) > _MAX_SHARE:
         return None
     # Charts are connected both on the surface and in the atlas. No texel's centre may lie in two
     # triangles, and none of two charts nearer than _GAP texels.
@@ -273,6 +274,28 @@ def unwrap_objects(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -
 
 
 def _unwrap_one(points: Float, triangles: Int, sizes: TexelSizes) -> tuple[Float, tuple[int, int]]:
+    corners, finest = points[triangles], float(sizes.side.min())
+    if len(triangles) > _WHOLE:
+        texels = doubled_areas(points, triangles) / 2 / sizes.side.astype(np.float64) ** 2
+        parts = parts_of(corners.mean(axis=1), float(texels.sum()))
+        # Steps reach as far as their root times an edge.
+        steps = math.ceil(np.clip(len(triangles) / texels.sum(), *_STEPS))
+        found = _by_xatlas(without_noise(points, triangles, steps), triangles, sizes, parts)
+        if found:
+            corner_uv, resolution = found
+            in_texels = corner_uv * np.array(resolution, np.float32)
+            if stretched_share(in_texels, corners, sizes.side) <= _MAX_SHARE:
+                return found
+    else:
+        parts = [np.arange(len(triangles))]
+    return _by_xatlas(points, triangles, sizes, parts) or pack_triangles_singly(corners, finest)
+
+
+def _by_xatlas(
+    points: Float, triangles: Int, sizes: TexelSizes, parts: Sequence[Long]
+) -> tuple[Float, tuple[int, int]] | None:
+    """corner_uv (F, 3, 2) and the size of the atlas, no chart of which reaches from one part to
+    another; None where what xatlas returns is none."""
     import xatlas
 
     low, high = points.min(axis=0), points.max(axis=0)
@@ -280,7 +303,6 @@ def _unwrap_one(points: Float, triangles: Int, sizes: TexelSizes) -> tuple[Float
     unit = ((points - low) / max(extent, 1e-12)).astype(np.float32)
     finest = float(sizes.side.min())
     atlas = xatlas.Atlas()
-    parts = parts_of(points[triangles].mean(axis=1))
     for part in parts:
         _, own, corners = compact(unit, triangles[part])
         atlas.add_mesh(own, corners.astype(np.uint32))
@@ -295,22 +317,23 @@ def _unwrap_one(points: Float, triangles: Int, sizes: TexelSizes) -> tuple[Float
         atlas = _at_own_densities(atlas, parts, *laid_out, points, triangles, sizes, options)
         laid_out = _laid_out(atlas, [np.arange(len(triangles))])
     width, height = int(atlas.width), int(atlas.height)
-    if laid_out and min(width, height) > 0:
-        uv, places = laid_out
-        corner_uv = beside_neighbours(uv[places], points, triangles, sizes.side)
-        if corner_uv is not None:
-            corner_uv[..., 1] = 1 - corner_uv[..., 1]
-            return corner_uv, (width, height)
-    return pack_triangles_singly(points[triangles], finest)
+    if laid_out is None or min(width, height) == 0:
+        return None
+    uv, places = laid_out
+    corner_uv = beside_neighbours(uv[places], points, triangles, sizes.side)
+    if corner_uv is None:
+        return None
+    corner_uv[..., 1] = 1 - corner_uv[..., 1]
+    return corner_uv, (width, height)
 
 
-def parts_of(centres: Float) -> list[Long]:
-    """Triangles at ``centres`` (F, 3) in parts that are near each other and about equally many:
-    all in one, or of many triangles at most _FACES_OF_PART each."""
-    if len(centres) <= _WHOLE:
-        return [np.arange(len(centres))]
+def parts_of(centres: Float, texels: float) -> list[Long]:
+    """Triangles at ``centres`` (F, 3), which have so many texels in all, in parts that are near
+    each other and about equally many."""
+    fewest, most = _FACES_OF_PART
+    most = int(np.clip(_TEXELS_OF_PART * len(centres) / max(texels, 1), fewest, most))
     parts = [np.arange(len(centres))]
-    while len(parts[0]) > _FACES_OF_PART:
+    while len(parts[0]) > most:
         halves = []
         for part in parts:
             along = centres[part, np.ptp(centres[part], axis=0).argmax()]
@@ -318,6 +341,35 @@ def parts_of(centres: Float) -> list[Long]:
             halves += [np.sort(order[:middle]), np.sort(order[middle:])]
         parts = halves
     return parts
+
+
+def without_noise(points: Float, triangles: Int, steps: int) -> Float:
+    """Points (V, 3) of a surface that bends less within about the root of ``steps`` edges, and is
+    as large as before (Taubin, A Signal Processing Approach to Fair Surface Design, 1995)."""
+    ends = np.concatenate([triangles[:, [a, b]] for a in range(3) for b in range(3) if a != b]).T
+    beside = coo_array((np.ones(len(ends[0]), np.int8), tuple(ends)), shape=(len(points),) * 2)
+    links = (beside.tocsr() > 0).astype(np.float64)
+    number = np.maximum(links.sum(axis=1), 1)[:, None]
+    smooth = points.astype(np.float64)
+    for _ in range(steps):
+        for share in (0.5, -0.53):
+            smooth += share * (links @ smooth / number - smooth)
+    return smooth.astype(np.float32)
+
+
+def stretched_share(texels: Float, corners: Float, side: Float) -> float:
+    """The share of the area whose texels' sides on the surface, the longest or the shortest, differ
+    from those wanted, ``side`` (F,) in metres, by more than _MAX_STRETCH. texels (F, 3, 2): places
+    of the corners (F, 3, 3) in the atlas."""
+    edges = (corners[:, 1:] - corners[:, :1]).astype(np.float64)
+    flat = (texels[:, 1:] - texels[:, :1]).astype(np.float64)
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    laid = (np.abs(np.linalg.det(flat)) > 1e-9) & (area > 0)
+    metres = np.linalg.svd(np.linalg.inv(flat[laid]) @ edges[laid], compute_uv=False)
+    stretch = metres / side[laid, None]
+    odd = ~laid
+    odd[laid] = ((stretch > _MAX_STRETCH) | (stretch < 1 / _MAX_STRETCH)).any(axis=1)
+    return float(area[odd].sum() / max(area.sum(), 1e-30))
 
 
 def _laid_out(atlas: Any, parts: Sequence[Long]) -> tuple[Float, Long] | None:
