@@ -9,7 +9,7 @@ import pytest
 
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 
-FIRST_GUESS, INDEPENDENT, OF_SPECULAR = 0.02, 0.012, 0.05
+FIRST_GUESS, INDEPENDENT, OF_SPECULAR = 0.02, 0.012, 0.25
 CELL = 0.1
 
 
