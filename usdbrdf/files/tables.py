@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, cast
 from xml.etree import ElementTree
@@ -23,6 +23,13 @@ from usdbrdf.files.documents import (
 from usdbrdf.model.arrays import Array, Double
 
 Element = ElementTree.Element
+
+
+def files_of(path: Path, suffixes: Collection[str]) -> list[Path]:
+    """The files in a folder, or the one that ``path`` is, that end in one of these suffixes, which
+    are small letters, in letters of any case."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return [file for file in files if file.suffix.lower() in suffixes and file.is_file()]
 
 
 def beginning_of(path: Path, num_bytes: int = 2000) -> bytes:

@@ -20,7 +20,7 @@ from usdbrdf.job.child import child
 from usdbrdf.job.progress import say, warn
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Array, Double, Float, Int, Long
-from usdbrdf.model.mesh import compact, doubled_areas
+from usdbrdf.model.mesh import compact, doubled_areas, halved
 from usdbrdf.model.scene import Scene, SceneObject
 
 # Texels between charts: of those that came along, so that bilinear lookup stays inside its own; of
@@ -333,13 +333,8 @@ def parts_of(centres: Float, texels: float) -> list[Long]:
     fewest, most = _FACES_OF_PART
     most = int(np.clip(_TEXELS_OF_PART * len(centres) / max(texels, 1), fewest, most))
     parts = [np.arange(len(centres))]
-    while len(parts[0]) > most:
-        halves = []
-        for part in parts:
-            along = centres[part, np.ptp(centres[part], axis=0).argmax()]
-            order, middle = part[np.argsort(along, kind="stable")], (len(part) + 1) // 2
-            halves += [np.sort(order[:middle]), np.sort(order[middle:])]
-        parts = halves
+    while len(parts[-1]) > most:
+        parts = [np.sort(half) for part in parts for half in halved(centres, part)]
     return parts
 
 

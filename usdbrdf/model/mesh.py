@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 
 # What a person may ask about an object: of shading, of the fit; and what is then not fitted.
 LAMP, METAL, GLASS, REFIT = "lamp", "metal", "glass", "refit"
@@ -158,6 +158,14 @@ def compact(points: Array, triangles: Array) -> tuple[Array, Array, Int]:
     triangles between them, int32."""
     used, corners = np.unique(triangles, return_inverse=True)
     return used, points[used], corners.reshape(-1, 3).astype(np.int32)
+
+
+def halved(points: Float, part: Long) -> tuple[Long, Long]:
+    """The points (V, 3) numbered ``part`` in two halves beside each other along their widest side,
+    of an odd number more in the second."""
+    along = points[part, int(np.ptp(points[part], axis=0).argmax())]
+    order = part[np.argsort(along, kind="stable")]
+    return order[: len(order) // 2], order[len(order) // 2 :]
 
 
 def welded_ids(points: Float) -> Int:

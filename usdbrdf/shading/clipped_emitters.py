@@ -22,6 +22,7 @@ from scipy.optimize import minimize
 from usdbrdf import calibration
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
+from usdbrdf.model.mesh import halved
 
 
 @kernel
@@ -446,12 +447,8 @@ def _without_parts(position: Float) -> list[Bool]:
     along their widest side three times."""
     parts = [np.arange(len(position))]
     for _ in range(3):
-        halves = []
-        for part in parts:
-            along = position[part, int(np.ptp(position[part], axis=0).argmax())]
-            order = part[np.argsort(along, kind="stable")]
-            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
-        parts = [part for part in halves if len(part)]
+        halves = (half for part in parts for half in halved(position, part))
+        parts = [half for half in halves if len(half)]
     kept = np.ones((len(parts), len(position)), np.bool_)
     for own, part in zip(kept, parts, strict=True):
         own[part] = False

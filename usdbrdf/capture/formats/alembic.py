@@ -7,6 +7,7 @@ from typing import NoReturn
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.tables import files_of
 from usdbrdf.options import CaptureOptions
 
 NAME = "alembic"
@@ -15,8 +16,7 @@ DESCRIPTION = DESCRIPTIONS[NAME]
 
 def matches(path: Path) -> bool:
     """An Alembic file, or a folder with one."""
-    files = path.iterdir() if path.is_dir() else (path,)
-    return any(file.suffix.lower() == ".abc" and file.is_file() for file in files)
+    return bool(files_of(path, [".abc"]))
 
 
 def read(path: Path, options: CaptureOptions) -> NoReturn:

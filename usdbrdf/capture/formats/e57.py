@@ -22,6 +22,7 @@ from usdbrdf.capture.formats.named_pictures import (
     warn_of_radiance,
 )
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.tables import files_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Lens
@@ -40,8 +41,7 @@ def matches(path: Path) -> bool:
 
 
 def _file_of(path: Path) -> Path | None:
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    files = [file for file in files if file.suffix.lower() == ".e57" and file.is_file()]
+    files = files_of(path, [".e57"])
     return files[0] if len(files) == 1 else None
 
 

@@ -30,7 +30,7 @@ from usdbrdf.capture.formats.named_pictures import (
 )
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.tables import Element, beginning_of, number_in, numbers_of, read_xml
+from usdbrdf.files.tables import Element, beginning_of, files_of, number_in, numbers_of, read_xml
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
@@ -51,8 +51,7 @@ def matches(path: Path) -> bool:
 
 
 def _documents(path: Path) -> list[Path]:
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    heads = ((file, beginning_of(file)) for file in files if file.suffix.lower() == ".xml")
+    heads = ((file, beginning_of(file)) for file in files_of(path, [".xml"]))
     return [file for file, head in heads if b"<chunk" in head and b"<sensors" in head]
 
 

@@ -36,7 +36,7 @@ from usdbrdf.capture.formats.named_pictures import (
 )
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
-from usdbrdf.files.tables import Element, beginning_of, csv_rows, number_in, read_xml
+from usdbrdf.files.tables import Element, beginning_of, csv_rows, files_of, number_in, read_xml
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Lens
@@ -56,8 +56,7 @@ def matches(path: Path) -> bool:
 
 
 def _tables(path: Path) -> list[Path]:
-    files = [path] if path.is_file() else sorted(path.iterdir()) if path.is_dir() else []
-    return [file for file in files if file.suffix.lower() == ".csv" and _is_table(file)]
+    return [file for file in files_of(path, [".csv"]) if _is_table(file)]
 
 
 def _is_table(file: Path) -> bool:

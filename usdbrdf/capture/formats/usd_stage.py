@@ -32,6 +32,7 @@ from usdbrdf.capture.parts import geometry_from_file, geometry_from_usd
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
 from usdbrdf.files.naming import identifier_from
+from usdbrdf.files.tables import files_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
@@ -68,10 +69,7 @@ def matches(path: Path) -> bool:
 
 
 def _stage_of(path: Path) -> Path | None:
-    if path.is_file():
-        return path if path.suffix.lower() in USD_SUFFIXES else None
-    inside = path.iterdir() if path.is_dir() else ()
-    files = [p for p in inside if p.suffix.lower() in USD_SUFFIXES and p.is_file()]
+    files = files_of(path, USD_SUFFIXES)
     return files[0] if len(files) == 1 else None
 
 
