@@ -290,8 +290,9 @@ def test_couplings_are_those_of_least_squares_and_of_one_object_alone(strips: Wo
             np.add.at(covers, first + corner[:, 1] * width + corner[:, 0], share)
         if (covers[surface.own[texels.pixel] < 0] > 0).any():
             continue  # covers a texel that nobody asks for: not among a frame's
-        matrix += pixels.weight[m] * np.outer(covers, covers)
-        pull += pixels.weight[m] * np.outer(covers, pixels.rest[m])
+        some = np.flatnonzero(covers)
+        matrix[np.ix_(some, some)] += pixels.weight[m] * np.outer(covers[some], covers[some])
+        pull[some] += pixels.weight[m] * np.outer(covers[some], pixels.rest[m])
     asked = matrix.diagonal() > 0
     assert asked.sum() > 200
     unasked = surface.own[texels.pixel] < 0
