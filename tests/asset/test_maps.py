@@ -12,6 +12,7 @@ from tests.scenes import make_capture, poses_down_and_up
 from usdbrdf.asset import maps as module
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.model.texels import CoverageMap
 
 
 def test_every_map_is_decoded_once(tmp_path, monkeypatch: pytest.MonkeyPatch):
@@ -61,6 +62,21 @@ def test_light_that_was_inferred_is_doubted_by_its_errors(tmp_path, monkeypatch)
     every = doubt.radiance.at(
         maps.texels.face.astype(np.int32), *np.float32(maps.texels.barycentric[:, 1:].T)
     )
-    assert not every[~maps.emissive & maps.coverage.measured].any(axis=1).mean() > 0.02
+    seen = ~maps.emissive & maps.coverage.measured
+    assert not (every[seen] > 0.01 * maps.light[seen]).any(axis=1).mean() > 0.02
+    # What no frame shows is doubted whether or not there are such lamps.
+    hidden = ~(maps.emissive | maps.coverage.observed) & maps.texels.interior
+    assert hidden.sum() > 50
+    light = maps.light[hidden].mean(axis=0)
     monkeypatch.setitem(maps.__dict__, "doubts_of_light", {})
+    doubt = maps.light_in_doubt("estimate")
+    assert doubt is not None
+    shown = doubt.radiance.at(
+        maps.texels.face[hidden].astype(np.int32),
+        *np.float32(maps.texels.barycentric[hidden, 1:].T),
+    )
+    np.testing.assert_allclose(shown.mean(axis=0), 0.3 * light, rtol=0.2)
+    assert not doubt.emission.pixels.any()
+    every = np.ones(len(maps.texels), np.bool_)
+    monkeypatch.setitem(maps.__dict__, "coverage", CoverageMap.of(every, ~every))
     assert maps.light_in_doubt("estimate") is None

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Ar, Usd, UsdGeom
 
+from usdbrdf import calibration
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.properties import Aov
 from usdbrdf.asset.readers.scene import (
@@ -50,8 +51,9 @@ _AT_A_TIME = min(4, os.cpu_count() or 1)
 _MAX_WIDTH = 640
 # The camera is chosen among this many frames, by about this many rays through each.
 _CANDIDATES, _RAYS = 64, 2000
-# Of light of which only a bound is known: relative error.
-_OF_BOUND = 1.0
+# Relative errors: of light of which only a bound is known, and of what surfaces send out that no
+# frame shows.
+_OF_BOUND, _OF_HIDDEN = 1.0, calibration.number("hidden.error")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,15 +266,18 @@ class AssetMaps:
         return {name: error for name, error in found.items() if error > 0}
 
     def light_in_doubt(self, asked: Surroundings) -> LitScene | None:
-        """The scene in nothing but the standard errors of its light; None where all of that was
+        """The scene in nothing but the standard errors of its light: of lamps and surroundings that
+        were inferred, and of what surfaces send out that no frame shows; None where all of that was
         seen. What a file says of the surroundings is not doubted."""
         doubts = self.doubts_of_light
         of_object = [doubts.get(obj.prim_path, 0.0) for obj in self.scene.objects]
         error = np.array(of_object, np.float32)[self.texels.object_index()]
         inferred = self.emissive & ~self.coverage.measured & (error > 0)
         light = np.where(inferred[:, None], error[:, None] * self.emission, np.float32(0))
+        hidden = ~(self.coverage.observed | self.emissive)
+        light[hidden] = _OF_HIDDEN * self.light[hidden]
         outside = self._doubts_of_outside() if asked == ESTIMATE else black_environment()
-        if not (inferred.any() or outside.image.any() or outside.sun.shines):
+        if not (light.any() or outside.image.any() or outside.sun.shines):
             return None
         return lit_scene(self.surface, light, inferred, outside)
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Array, Bool, Double, Int, Long
@@ -135,17 +136,17 @@ def _solved_channel(
     of_albedo = num_sources + np.arange(num_segments)
     of_gloss = of_albedo + num_segments
 
-    first = (np.cumsum(size) - size)[size > 0]
+    first, every = np.append(0, np.cumsum(size)), np.arange(len(known))
+    # A row for each texel: what is done with it then lies together.
+    share = np.ascontiguousarray(sources.share.T)
 
-    def gathered(values: Double) -> Double:
-        """(..., M): sums of values (..., N) over the texels of each segment."""
-        sums = np.zeros((*values.shape[:-1], num_segments))
-        sums[..., size > 0] = np.add.reduceat(values, first, axis=-1)
-        return sums
+    def gathered(factor: Double, values: Double) -> Double:
+        """(M, ...): sums of factor (N,) times values (N, ...) over the texels of each segment."""
+        sums = sparse.csr_matrix((factor, every, first), (num_segments, len(every)))
+        return np.asarray(sums @ values)
 
     for _ in range(iterations):
-        brought = np.exp(g)[:, None] * sources.share
-        scattered = known + brought.sum(axis=0)
+        scattered = known + share @ np.exp(g)
         over_albedo = np.exp(-albedo)[asked.segment]
         total = scattered + gloss[asked.segment] * over_albedo * mirrored
         residual = observed - np.log(total) - albedo[asked.segment]
@@ -154,20 +155,21 @@ def _solved_channel(
         noise = _noise_of_segments(asked, residual, num_segments)[asked.segment]
         weight = (_FREEDOM + 1) / (_FREEDOM + (residual / noise) ** 2) / noise**2
         weight = weight * effective * counts
-        by_source = brought / total
+        by_source = share / total[:, None] * np.exp(g)
         by_albedo, by_gloss = scattered / total, over_albedo * mirrored / total
         rows = num_sources + 2 * num_segments + 1
         curvature, gradient = np.zeros((rows, rows)), np.zeros(rows)
-        curvature[:num_sources, :num_sources] = by_source @ (by_source * weight).T
-        gradient[:num_sources] = by_source @ (weight * residual)
+        weighted = by_source * np.sqrt(weight)[:, None]
+        curvature[:num_sources, :num_sources] = weighted.T @ weighted
+        gradient[:num_sources] = (weight * residual) @ by_source
         parts = by_albedo * weight, by_gloss * weight
         for place, part in zip((of_albedo, of_gloss), parts, strict=True):
-            both = gathered(by_source * part)
-            curvature[place, :num_sources], curvature[:num_sources, place] = both.T, both
-            gradient[place] = gathered(part * residual)
-        curvature[of_albedo, of_albedo] = gathered(by_albedo * parts[0])
-        curvature[of_gloss, of_gloss] = gathered(by_gloss * parts[1])
-        both = gathered(by_gloss * parts[0])
+            both = gathered(part, by_source)
+            curvature[place, :num_sources], curvature[:num_sources, place] = both, both.T
+            gradient[place] = gathered(part, residual)
+        curvature[of_albedo, of_albedo] = gathered(parts[0], by_albedo)
+        curvature[of_gloss, of_gloss] = gathered(parts[1], by_gloss)
+        both = gathered(parts[0], by_gloss)
         curvature[of_albedo, of_gloss] = curvature[of_gloss, of_albedo] = both
         _add_priors(curvature, gradient, sources, channel, (g, albedo, gloss, mean))
         # What would be less glossy than not at all stays as it is.
