@@ -112,6 +112,26 @@ def test_sun_and_sky_are_found_by_the_light_that_they_cast(sunny, clips: bool):
     assert 0.2 < found.open_share < 0.7
 
 
+def test_what_surfaces_mirror_is_not_taken_for_light_in_their_shadows(sunny):
+    surface, lit, albedo = sunny
+    # From everywhere the same light, next to which what shadows scatter is little.
+    sheen = 0.04 * np.median(lit, axis=0)
+    sheen = np.pi * np.where(albedo.mean(axis=1) < 0.45, 1.0, 0.5)[:, None] * sheen * [3, 5, 8]
+    every = np.ones(len(lit), np.bool_)
+    shown = lit + (sheen / np.pi).astype(np.float32)
+    seen = _seen(np.abs(_UP) < 0.3)
+
+    def off(mirrored=None) -> float:
+        found = light_from_outside(
+            surface, shown, CoverageMap.of(every, ~every), seen, True, 3, mirrored
+        )
+        assert found is not None
+        return float(np.abs(found.environment.sun.irradiance / SUN.irradiance - 1).mean())
+
+    # What is told is what usual dielectrics would mirror; these mirror 0.8 of that.
+    assert off(lambda outside, index: sheen[index] / 0.8) < 0.75 * off()
+
+
 def test_no_sun_is_found_where_none_shines(yard):
     surface, lit, _ = _lit(yard, Environment(SKY, True))
     every = np.ones(len(lit), np.bool_)

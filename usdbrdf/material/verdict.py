@@ -105,7 +105,8 @@ def lobe_from_costs(
         psi_error=min(psi_error, NOTHING_KNOWN),
         unresolved=footprint,
         cost=least / max(freedom, 1),
-        evidence=max(0.0, 1 - least / without) if without > 0 else 0.0,
+        # The rays' noise may make the least cost negative.
+        evidence=min(max(0.0, 1 - least / without), 1.0) if without > 0 else 0.0,
         phi_median=phi_median,
         psi_median=psi_median,
         psi_upper=psi_upper,

@@ -9,7 +9,7 @@ of the sun's direction (``sun_direction``), then of its irradiance and the patch
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +29,16 @@ from usdbrdf.shading.asked import (
     irradiance_of_texels,
     looked_around,
 )
+from usdbrdf.shading.gloss import mirrored_to_frames
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
-from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
+from usdbrdf.shading.outside_light import (
+    Asked,
+    Sources,
+    gloss_of_scene,
+    jackknife,
+    levelled,
+    solved,
+)
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
 from usdbrdf.transport.environment import (
@@ -48,6 +56,8 @@ _FIRST_RAYS, _RAYS = 32, 1024
 # To be chosen from, and texels to the side of one that see, up to this difference of their cosine
 # to it, as much of the sun.
 _MANY_PER_SEGMENT, _AROUND, _AS_SUNLIT = 960, 2, 0.05
+# What surfaces mirror is of the light that was found before.
+_LOOKS_AT_MIRRORED = 2
 # Where more of the sunlit texels are clear of shadows than this, all of them tell more.
 _MOSTLY_CLEAR = 0.5
 # Lower and upper elevation of a band of patches, degrees, and their number.
@@ -139,11 +149,20 @@ def estimated_outside(
         # What hides in a room would shine like what stands in the sun beside it.
         lamps, known = KnownLamps.unknown(len(lit)), _of_measured(seen, z_up)
         light = light_of_hidden(surface, lit, coverage, known, seed, lamps)
-        found = light_from_outside(surface, light, coverage, seen, z_up, seed)
+
+        def mirrored(outside: Environment, index: Long) -> Double:
+            return np.pi * mirrored_to_frames(surface, light, outside, frames, index, seed)
+
+        found = light_from_outside(surface, light, coverage, seen, z_up, seed, mirrored)
         return found.arrays() if found else {"nothing": np.zeros(0)}
 
     arrays = run.checkpoint("outside", compute)
     return None if "nothing" in arrays else Outside.restored(arrays)
+
+
+# Of an environment and texels (N,): what these would mirror of it and of all surfaces to the frames
+# if they were usual dielectrics, pi times that, (N, 3) W/m^2.
+Mirrored = Callable[[Environment, Long], Double]
 
 
 def light_from_outside(
@@ -153,9 +172,11 @@ def light_from_outside(
     seen: Surroundings,
     z_up: bool,
     seed: int,
+    mirrored: Mirrored | None = None,
 ) -> Outside | None:
     """What lights the scan ``lit`` (T, 3), L_d, from outside; None where hardly a direction of its
-    light leaves it. seen: what the frames show of it."""
+    light leaves it. seen: what the frames show of it; mirrored: None where ``lit`` holds nothing of
+    that."""
     asked = asked_texels(surface.texels, lit, coverage, seed)
     if asked is None:
         return None
@@ -190,6 +211,18 @@ def light_from_outside(
         found = solved(*with_sun)
         light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
     assert sun is not None
+    for _ in range(_LOOKS_AT_MIRRORED):
+        if mirrored is None:
+            break
+        radiance: Double = np.exp(found.log_radiance)
+        outside = Environment(_picture(seen, patches, used, radiance[:-1], z_up), z_up)
+        outside = outside.under(sun._replace(irradiance=radiance[-1]))
+        asked = asked._replace(mirrored=mirrored(outside, asked.texel))
+        own, sources = _with_sun(surface, asked, sky, sun, seed)
+        sources = gloss_of_scene(own, sources, np.zeros_like(sources.share))
+        sky, with_sun = sky._replace(gloss=sources.gloss), (own, sources)
+        found = solved(*with_sun)
+    light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
     strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
     error = jackknife(*with_sun, found)
     # What no texel sees keeps what was thought of it before, and errs by nothing.
@@ -201,6 +234,8 @@ def light_from_outside(
         if (clear := _clearly_lit(surface, many, sun, seed)) is not None:
             share, _ = _shares(surface, clear, unseen, z_up, seed, _RAYS)
             clear = _under_what_was_seen(surface, lit, clear, seen, z_up, seed)
+            if mirrored is not None:
+                clear = clear._replace(mirrored=mirrored(outside, clear.texel))
             clearly = _with_sun(surface, clear, sky._replace(share=share[used]), sun, seed)
             told = solved(*clearly)
             own_error = jackknife(*clearly, told)
@@ -357,6 +392,7 @@ def _with_sun(
         bound=np.append(sky.bound, False),
         pairs=sky.pairs,
         apart=sky.apart,
+        gloss=sky.gloss,
     )
     return asked.of(kept), sources
 
