@@ -214,9 +214,9 @@ def light_from_outside(
     for _ in range(_LOOKS_AT_MIRRORED):
         if mirrored is None:
             break
-        radiance: Double = np.exp(found.log_radiance)
-        outside = Environment(_picture(seen, patches, used, radiance[:-1], z_up), z_up)
-        outside = outside.under(sun._replace(irradiance=radiance[-1]))
+        strengths: Double = np.exp(found.log_radiance)
+        outside = Environment(_picture(seen, patches, used, strengths[:-1], z_up), z_up)
+        outside = outside.under(sun._replace(irradiance=strengths[-1]))
         asked = asked._replace(mirrored=mirrored(outside, asked.texel))
         own, sources = _with_sun(surface, asked, sky, sun, seed)
         sources = gloss_of_scene(own, sources, np.zeros_like(sources.share))
