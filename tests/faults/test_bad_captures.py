@@ -338,6 +338,16 @@ DROPPED: dict[str, tuple[Recipe, str, list[str]]] = {
         "capture.file",
         ["frames/0005.exr", "does not exist"],
     ),
+    "empty file_path": (
+        _frame(4, file_path=""),
+        "capture.file",
+        ["frames[4]", "its file_path is empty"],
+    ),
+    "no file_path": (
+        _manifest(lambda d: d["frames"][4].pop("file_path")),
+        "capture.file",
+        ["frames[4]", "it has no file_path"],
+    ),
     "truncated image": (
         _truncate(range(2, 3), 0.6),
         "capture.image",
@@ -428,6 +438,7 @@ def test_fault_is_refused(capture, fault):
 @pytest.mark.fault("I3", "nan beyond the limit")
 @pytest.mark.fault("I13", "empty image")
 @pytest.mark.fault("C1", "frame without pose", "frame without file")
+@pytest.mark.fault("C1", "empty file_path", "no file_path")
 @pytest.mark.fault("C4", "infinity in a pose", "pose with null")
 @pytest.mark.fault("C6", "duplicate image")
 @pytest.mark.fault("C10", "saturated frame")
