@@ -82,6 +82,22 @@ def test_geometry_stays_in_its_file_and_meshes_are_objects(capture):
     assert (capture.folder / "room.usda").read_bytes() == before
 
 
+def test_a_mesh_without_faces_is_left_out(capture, tmp_path):
+    stage = Usd.Stage.Open(str(capture.folder / "room.usda"))
+    _mesh(stage, "/scan/deleted", [], [], [])
+    _mesh(stage, "/scan/points", np.eye(3), [], [])
+    UsdGeom.Mesh.Define(stage, "/scan/nothing")
+    stage.Save()
+    scan = read_scan(capture.folder, IngestOptions())
+    assert scan.object_prims == tuple(f"{name}/surface" for name in capture.names)
+    (said,) = (s for s in scan.warnings if "[stage.empty]" in s)
+    assert "room.usda: 3 meshes have no faces and are left out, first </scan/deleted>" in said
+    asset = Asset(tmp_path / "asset", "asset")
+    ingest(capture.folder, asset, IngestOptions())
+    scene = scene_from_stage(open_weaker(asset, "texturing"))
+    assert len(scene.objects) == len(capture.names)
+
+
 def test_referenced_geometry_is_not_reduced(capture):
     with pytest.raises(UsageError, match=r"--decimate .* \[usage.option\]"):
         read_scan(capture.folder, IngestOptions(decimate=10))
@@ -213,7 +229,8 @@ _NAN = [(np.nan, 0, 0), (1, 0, 0), (0, 1, 0)]
         (_bad(np.eye(3), [3], [0, 1, -1]), "mesh.topology", "outside its 3 points"),
         (_bad(np.eye(3), [4], [0, 1, 2]), "mesh.topology", "3 corners where its faces need 4"),
         (_bad(np.eye(3), [2], [0, 1]), "mesh.topology", "a face of 2 corners"),
-        (_bad(np.zeros((0, 3)), [], []), "mesh.topology", "is empty"),
+        (_bad(np.zeros((0, 3)), [], []), "mesh.empty", "no visible mesh with faces below </scan>"),
+        (_bad(np.eye(3), [], [0, 1, 2]), "mesh.topology", "is empty"),
         (_asset("/etc/passwd"), "paths.outside", "'/etc/passwd' is an absolute path"),
         (_asset("../../secret.png"), "paths.outside", "leads outside"),
         (_asset("https://example.org/a.png"), "paths.outside", "is a URI"),

@@ -18,7 +18,7 @@ from usdbrdf.asset.readers.views import photographs_of_views
 from usdbrdf.capture import develop
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.develop import resampled
-from usdbrdf.capture.lens_views import pinhole_views
+from usdbrdf.capture.lens_views import pinhole_views, why_no_lens
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import read_frame
@@ -108,6 +108,38 @@ def test_a_wide_fisheye_becomes_faces_that_show_all_of_it():
         seen |= (z < 0) & (u > 0) & (u < width) & (v > 0) & (v < height)
     assert shown.sum() > 5000
     assert seen[shown].all()
+
+
+_FISHEYE = (0.0340, -0.0118, 0.0036, -0.0011)
+_ARIA = (0.4, -0.38, -0.17, 0.6, -0.42, 0.09)
+
+
+@pytest.mark.parametrize(
+    ("lens", "intrinsics", "size"),
+    [
+        # A telephone's main, wide and long camera.
+        (Lens(radial=(0.09, -0.26, 0.23)), (1480.0, 1480.0, 960.0, 720.0), (1920, 1440)),
+        (Lens(radial=(-0.03, 0.02, -0.005)), (760.0, 760.0, 960.0, 720.0), (1920, 1440)),
+        (Lens(radial=(1.6, -30.0)), (9000.0, 9000.0, 960.0, 720.0), (1920, 1440)),
+        # Action cameras: barrels that turn back beyond the corner, or just before it.
+        (Lens(radial=(-0.27, 0.1, -0.02), tangential=(4e-4, -3e-4)), (860.0, 860.0, 960.0, 540.0),
+         (1920, 1080)),
+        (Lens(radial=(-0.24,)), (900.0, 900.0, 960.0, 540.0), (1920, 1080)),
+        # OpenCV's rational model, and fisheyes: to the corner, of a whole circle, Aria's.
+        (Lens(radial=(8.2, 3.5, 0.1), divisor=(8.5, 6.1, 0.9)), (600.0, 600.0, 640.0, 360.0),
+         (1280, 720)),
+        (Lens(curve="fisheye", radial=_FISHEYE), (790.0, 790.0, 876.0, 584.0), (1752, 1168)),
+        (Lens(curve="fisheye", radial=(-0.05, 0.004)), (330.0, 330.0, 960.0, 540.0), (1920, 1080)),
+        (Lens(curve="fisheye", radial=_ARIA, tangential=(4e-4, 3e-4), prism=(6e-4, 0, -3e-4, 0),
+              radial_first=True), (610.0, 610.0, 704.0, 704.0), (1408, 1408)),
+        (Lens(curve="eucm", shape=(0.6, 1.1)), (500.0, 500.0, 640.0, 360.0), (1280, 720)),
+        # A sphere whose height was rounded, and a part of one.
+        (Lens(curve="equirectangular"), whole_sphere(5793, 2896), (5793, 2896)),
+        (Lens(curve="equirectangular"), (900.0, 800.0, 500.0, 100.0), (1000, 400)),
+    ],
+)  # fmt: skip
+def test_lenses_that_cameras_have_are_believed(lens, intrinsics, size):
+    assert why_no_lens(lens, intrinsics, size) == ""
 
 
 def test_no_detail_is_lost_and_pixels_are_not_multiplied():

@@ -121,6 +121,52 @@ def test_an_export_may_be_called_in_capitals(project, room):
     assert_same(read_scan(project, OPTIONS), room, names=room.names)
 
 
+@pytest.mark.parametrize("empty", ["<chunk/>", "<chunk><sensors/><cameras/></chunk>", "disabled"])
+def test_the_first_chunk_may_have_no_cameras(project, room, empty):
+    document = ET.parse(project / "cameras.xml").getroot()
+    (chunk,) = document
+    first = ET.fromstring(ET.tostring(chunk) if empty == "disabled" else empty)
+    if empty == "disabled":
+        first.set("enabled", "false")
+        first.find("sensors/sensor/calibration[@class='adjusted']/f").text = "3"
+    document.insert(0, first)
+    ET.ElementTree(document).write(project / "cameras.xml")
+    assert choose_adapter(project).name == "metashape"
+    scan = read_scan(project, OPTIONS)
+    assert_same(scan, room, names=room.names)
+    said = [s for s in scan.warnings if "2 chunks have cameras" in s and "'Chunk 1'" in s]
+    assert len(said) == (empty == "disabled")
+
+
+def test_cameras_of_one_label_are_told_apart_by_their_groups_or_left_out(project, room):
+    document = ET.parse(project / "cameras.xml").getroot()
+    cameras = document.find("chunk/cameras")
+    for i, folder in ((6, "walk"), (7, "other")):
+        (project / "images" / folder).mkdir()
+        picture = project / "images" / f"DSC{i:04d}.jpg"
+        picture.rename(project / "images" / folder / "DSC.jpg")
+        camera = next(c for c in cameras.iter("camera") if c.get("id") == str(i))
+        camera.set("label", "DSC.JPG")
+    ET.ElementTree(document).write(project / "cameras.xml")
+    for held in ("one picture", "no picture or several"):
+        scan = read_scan(project, OPTIONS)  # both are in the group walk
+        assert len(scan.frames) == 8
+        (said,) = (s for s in scan.warnings if "[capture.label]" in s)
+        assert "2 of 10 frames dropped, 'DSC.JPG', 'DSC.JPG': 2 cameras have this label" in said
+        assert held in said
+        if held == "one picture":
+            (project / "images/walk").rename(project / "images/third")
+    (project / "images/third").rename(project / "images/walk")
+    group = cameras.find("group")
+    moved = next(c for c in group if c.get("id") == "7")
+    group.remove(moved)
+    _child(cameras, "group", id="1", label="other").append(moved)
+    ET.ElementTree(document).write(project / "cameras.xml")
+    order = [*range(6), 8, 9, 7, 6]
+    scan = read_scan(project, OPTIONS)
+    assert_same(scan, room, poses=room.world_from_camera[order], names=room.names)
+
+
 def test_of_a_rig_only_the_master_has_a_transform(tmp_path, room):
     """Two cameras on one rig, at five places; the transform is the component's."""
     document, sensors, cameras = _chunk(component=True)

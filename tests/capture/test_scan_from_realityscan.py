@@ -15,7 +15,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
 
 OPTIONS = IngestOptions(assume_srgb=True)
-_COLUMNS = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
+_HEADER = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
 _NEWER = "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"
 
 
@@ -37,7 +37,7 @@ def _lens(room):
     return fx / WIDTH * 36, (cx - WIDTH / 2) / WIDTH, (cy - HEIGHT / 2) / WIDTH
 
 
-def write_table(folder, room, header=_COLUMNS, bent="0,0,0,0,0,0", separator=","):
+def write_table(folder, room, header=_HEADER, bent="0,0,0,0,0,0", separator=","):
     f, px, py = _lens(room)
     rows = [header]
     for i, pose in enumerate(room.world_from_camera):
@@ -51,7 +51,7 @@ def write_table(folder, room, header=_COLUMNS, bent="0,0,0,0,0,0", separator=","
     return folder
 
 
-@pytest.mark.parametrize(("header", "separator"), [(_COLUMNS, ","), (_NEWER, ";")])
+@pytest.mark.parametrize(("header", "separator"), [(_HEADER, ","), (_NEWER, ";")])
 def test_cameras_of_the_table(tmp_path, room, header, separator):
     folder = write_table(write_pictures(tmp_path / "scan", room), room, header, separator=separator)
     assert choose_adapter(folder).name == "realityscan"
@@ -66,6 +66,36 @@ def test_a_table_that_a_spreadsheet_has_saved(tmp_path, room):
     rows = table.read_text().splitlines()[1:]
     table.unlink()
     (folder / "Registration.CSV").write_bytes("\r\n".join(rows).encode("utf-8-sig"))
+    assert choose_adapter(folder).name == "realityscan"
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+
+
+def _with_decimal_commas(text):
+    return text.replace(",", ";").replace(".jpg", "?jpg").replace(".", ",").replace("?jpg", ".jpg")
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        lambda text: text.encode("utf-16"),
+        lambda text: b"\xfe\xff" + text.encode("utf-16-be"),
+        lambda text: f"sep=,\r\n{text}".encode(),
+        lambda text: f'\ufeff"sep=;"\n{text.replace(",", ";")}'.encode(),
+        lambda text: _with_decimal_commas(text).encode(),
+        lambda text: f"sep=;\n{_with_decimal_commas(text)}".encode("utf-16"),
+        lambda text: _with_decimal_commas(text).replace(";", "\t").encode("utf-16"),
+        lambda text: (
+            f"{text}\n# 10 cameras, all aligned\nexported by, the user\nThe end.\n\n".encode()
+        ),
+        lambda text: (text + "\n" + 15 * "," + "\n").encode(),
+        lambda text: f"# exported by, the user, in metres\n{text}".encode(),
+    ],
+)
+def test_tables_as_programs_and_spreadsheets_write_them(tmp_path, room, written):
+    folder = write_table(write_pictures(tmp_path / "scan", room), room)
+    table = folder / "registration.csv"
+    text = table.read_text().split("\n", 1)[1].rstrip()
+    table.write_bytes(written(text))
     assert choose_adapter(folder).name == "realityscan"
     assert_same(read_scan(folder, OPTIONS), room, names=room.names)
 

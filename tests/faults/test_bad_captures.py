@@ -284,6 +284,26 @@ REFUSED: dict[str, tuple[Recipe, str, list[str]]] = {
         "capture.camera",
         ["frames/0002.exr", "distortion_params", "Correct"],
     ),
+    "distortion that squeezes": (
+        _manifest(lambda d: d.update(k1=1e10)),
+        "capture.camera",
+        ["frames/0000.exr", "k1 10000000000.0", "degrees off its axis", "Correct", "distortion"],
+    ),
+    "distortion that turns back": (
+        _manifest(lambda d: d.update(k1=-20)),
+        "capture.camera",
+        ["frames/0000.exr", "k1 -20.0", "turns back", "have no direction"],
+    ),
+    "distortion that moves aside": (
+        _manifest(lambda d: d.update(p1=1e3)),
+        "capture.camera",
+        ["frames/0000.exr", "p1 1000.0", "moves its corners aside"],
+    ),
+    "panorama of another shape": (
+        _manifest(lambda d: d.update(camera_model="EQUIRECTANGULAR")),
+        "capture.camera",
+        ["frames/0000.exr", "32 x 24", "2 : 1"],
+    ),
     "no focal length": (
         _manifest(lambda d: [d.pop("fl_x"), d.pop("fl_y")]),
         "capture.camera",
@@ -317,6 +337,16 @@ DROPPED: dict[str, tuple[Recipe, str, list[str]]] = {
         lambda c: c.image(5).unlink(),
         "capture.file",
         ["frames/0005.exr", "does not exist"],
+    ),
+    "empty file_path": (
+        _frame(4, file_path=""),
+        "capture.file",
+        ["frames[4]", "its file_path is empty"],
+    ),
+    "no file_path": (
+        _manifest(lambda d: d["frames"][4].pop("file_path")),
+        "capture.file",
+        ["frames[4]", "it has no file_path"],
     ),
     "truncated image": (
         _truncate(range(2, 3), 0.6),
@@ -377,6 +407,8 @@ def test_the_capture_is_good_without_a_fault(capture):
 @pytest.mark.fault("C10", "all saturated")
 @pytest.mark.fault("C11", "all black")
 @pytest.mark.fault("C12", "fisheye", "a list as camera model", "distortion")
+@pytest.mark.fault("C12", "distortion that squeezes", "distortion that turns back")
+@pytest.mark.fault("C12", "distortion that moves aside", "panorama of another shape")
 @pytest.mark.fault("C13", "not json", "deep json", "duplicate key")
 @pytest.mark.fault("G1", "missing mesh", "empty mesh")
 @pytest.mark.fault("G2", "nan vertices", "face index out of range", "negative face index")
@@ -406,6 +438,7 @@ def test_fault_is_refused(capture, fault):
 @pytest.mark.fault("I3", "nan beyond the limit")
 @pytest.mark.fault("I13", "empty image")
 @pytest.mark.fault("C1", "frame without pose", "frame without file")
+@pytest.mark.fault("C1", "empty file_path", "no file_path")
 @pytest.mark.fault("C4", "infinity in a pose", "pose with null")
 @pytest.mark.fault("C6", "duplicate image")
 @pytest.mark.fault("C10", "saturated frame")

@@ -231,11 +231,62 @@ def test_channels_are_chosen_by_name(tmp_path):
 
 
 @pytest.mark.fault("I8")
-@pytest.mark.parametrize("names", [("Y",), ("U", "V"), ("R", "G"), ("a.R", "a.G", "a.B", "a.A")])
+@pytest.mark.parametrize("names", [("Y",), ("U", "V"), ("R", "G"), ("a.R", "b.G", "a.B", "a.A")])
 def test_wrong_channels_are_listed(tmp_path, names):
     write_with_oiio(tmp_path / "a.exr", np.ones((3, 4, len(names)), np.float32), names)
     with pytest.raises(ImageRefused, match=r"no channels R, G and B among .+\[image\.channels\]$"):
         read_radiance(tmp_path / "a.exr")
+
+
+def _layer(name, letters="RGBA"):
+    return tuple(f"{name}.{letter}" for letter in letters)
+
+
+@pytest.mark.fault("I8")
+@pytest.mark.parametrize(
+    ("names", "chosen"),
+    [
+        (_layer("beauty", "RGB"), [0, 1, 2]),
+        # As Blender writes them, and Nuke.
+        ((*_layer("ViewLayer.Combined"), "ViewLayer.Depth.Z", *_layer("ViewLayer.Normal", "XYZ")),
+         [0, 1, 2, 3]),
+        ((*_layer("ViewLayer.DiffDir", "RGB"), *_layer("ViewLayer.Combined")), [3, 4, 5, 6]),
+        (("beauty.blue", "beauty.green", "beauty.red", "depth.Z"), [2, 1, 0]),
+        ((*_layer("albedo", "RGB"), *_layer("RGBA", "rgb")), [3, 4, 5]),
+        ((*_layer("beauty"), "R", "G", "B"), [4, 5, 6]),
+    ],
+)  # fmt: skip
+def test_of_layers_that_of_the_whole_picture_is_read(tmp_path, names, chosen):
+    pixels = np.tile(np.arange(len(names), dtype=np.float32), (3, 4, 1))
+    write_with_oiio(tmp_path / "a.exr", pixels, names)
+    assert read_radiance(tmp_path / "a.exr", alpha=True)[0, 0].tolist() == chosen
+
+
+@pytest.mark.fault("I8")
+@pytest.mark.parametrize(
+    "names",
+    [
+        (*_layer("diffuse", "RGB"), *_layer("specular", "RGB")),
+        (*_layer("Left.Combined", "RGB"), *_layer("Right.Combined", "RGB")),
+    ],
+)
+def test_layers_of_which_none_is_the_whole_picture_are_listed(tmp_path, names):
+    write_with_oiio(tmp_path / "a.exr", np.ones((3, 4, 6), np.float32), names)
+    layers = f"{names[0][:-2]!r}, {names[3][:-2]!r}"
+    said = rf"2 layers have R, G and B \({layers}\), .* beauty or Combined\. Export .*channels\]$"
+    with pytest.raises(ImageRefused, match=said):
+        read_radiance(tmp_path / "a.exr")
+
+
+@pytest.mark.fault("I8")
+def test_layers_may_be_parts_of_the_file(tmp_path, radiance):
+    path, names = tmp_path / "a.exr", (_layer("diffuse", "RGB"), _layer("beauty", "RGB"))
+    _two_parts(path, radiance + 1, radiance, names)
+    assert np.array_equal(read_radiance(path), radiance.astype(np.float16))
+    assert image_size(path) == (40, 24, names[1])
+    _two_parts(path, radiance, radiance + 1, (names[0], _layer("gloss", "RGB")))
+    with pytest.raises(ImageRefused, match=r"2 layers have R, G and B \('diffuse', 'gloss'\)"):
+        read_radiance(path)
 
 
 @pytest.mark.fault("I9")

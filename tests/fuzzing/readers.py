@@ -226,11 +226,15 @@ READERS = {
                 name=kind,
                 seeds=getattr(seeds, kind),
                 read=_mesh_and_model,
-                lines=("usdbrdf.untrusted.mesh_files",),
+                lines=("usdbrdf.untrusted.mesh_files", of_kind),
                 in_child=True,
                 unknown=frozenset(("corner_normals",)),
             )
-            for kind in ("ply", "obj", "glb")
+            for kind, of_kind in (
+                ("ply", "usdbrdf.untrusted.mesh_ply"),
+                ("obj", "usdbrdf.untrusted.mesh_text"),
+                ("glb", "usdbrdf.untrusted.mesh_gltf:geometry_not_read,_bent"),
+            )
         ),
         Reader(
             name="labelled-ply",
@@ -307,6 +311,7 @@ READERS = {
             lines=("usdbrdf.capture.formats.replica_semantics",),
         ),
         _of_capture("scannetpp", photographs=True),
+        _of_capture("scannet", photographs=True),
         _of_capture("metashape", photographs=True),
         _of_capture("realityscan", photographs=True),
         _of_capture("e57", photographs=True),

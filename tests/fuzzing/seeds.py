@@ -27,6 +27,7 @@ from tests.capture import (
     test_scan_from_realityscan,
     test_scan_from_replica,
     test_scan_from_scanner_app,
+    test_scan_from_scannet,
     test_scan_from_scannetpp,
     test_scan_from_usd_stage,
 )
@@ -411,6 +412,12 @@ def replica(folder: Path) -> list[Seed]:
 def scannetpp(folder: Path) -> list[Seed]:
     scene = test_scan_from_scannetpp.write_scene(folder / "0a5c", _room())
     return _capture(scene, "scans/segments.json", "scans/segments_anno.json")
+
+
+def scannet(folder: Path) -> list[Seed]:
+    scene = test_scan_from_scannet.write_scene(folder / "scene0000_00", _room())
+    lens = "intrinsic/intrinsic_color.txt"
+    return _capture(scene, "pose/3.txt", lens, "scene0000_00.txt", "*.aggregation.json")
 
 
 def metashape(folder: Path) -> list[Seed]:

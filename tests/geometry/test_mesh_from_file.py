@@ -108,10 +108,143 @@ def test_corners_with_texture_coordinates_part_no_vertices(tmp_path, order):
     assert mesh.face_label.tolist() == [6, 7, 8]
 
 
-def test_a_polygon_of_five_corners_is_named(tmp_path):
-    _polygons(tmp_path / "five.ply", "<", [[1, 4, 2], [0, 1, 2, 3, 4]])
-    with pytest.raises(InputRefused, match=r"a face has 5 corners.*\[mesh\.read\]$"):
-        mesh_from_file(tmp_path / "five.ply")
+# A room in the shape of an L, seen from above, which a fan from its first corner leaves; a square
+# with a square hole, which a cut joins to the outline.
+_L = [(2, 1), (1, 1), (1, 2), (0, 2), (0, 0), (2, 0)]
+_HOLED = [
+    (0, 0), (3, 0), (3, 3), (0, 3), (0, 0), (1, 1), (1, 2), (2, 2), (2, 1), (1, 1),
+]  # fmt: skip
+_DART = [(0, 0), (4, 1), (0, 2), (1, 1)]
+
+
+def _files_of_polygon(folder: Path, corners: list[tuple[int, int]], *, turned: bool) -> list[Path]:
+    """A triangle, then the polygon, in a plane that leans, in OBJ and in both kinds of PLY."""
+    points = [*((x, y, x + 2.0 * y) for x, y in corners), (0, 0, 5), (1, 0, 6), (0, 1, 7)]
+    faces = [[len(corners), len(corners) + 1, len(corners) + 2], [*range(len(corners))]]
+    faces = [face[::-1] for face in faces] if turned else faces
+    rows = [f"v {x} {y} {z}" for x, y, z in points]
+    rows += ["f " + " ".join(f"{i + 1}/1" for i in face) for face in faces]
+    (folder / "polygon.obj").write_text("\n".join(["vt 0 0", *rows, ""]))
+    head = (
+        f"ply\nformat {{}} 1.0\nelement vertex {len(points)}\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 2\nproperty list uchar int vertex_indices\n"
+        "property int object_id\nend_header\n"
+    )
+    rows = [f"{x} {y} {z}" for x, y, z in points]
+    rows += [f"{len(face)} {' '.join(map(str, face))} {7 + i}" for i, face in enumerate(faces)]
+    (folder / "text.ply").write_text(head.format("ascii") + "\n".join(rows) + "\n")
+    body = np.float32(points).tobytes()
+    for i, face in enumerate(faces):
+        body += struct.pack(f"<B{len(face)}ii", len(face), *face, 7 + i)
+    (folder / "binary.ply").write_bytes(head.format("binary_little_endian").encode() + body)
+    return [folder / name for name in ("polygon.obj", "text.ply", "binary.ply")]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(("corners", "area"), [(_L, 3), (_L[:5], 2), (_HOLED, 8), (_DART, 3)])
+def test_polygons_of_any_shape_are_covered_once(tmp_path, corners, area, turned):
+    for path in _files_of_polygon(tmp_path, corners, turned=turned):
+        mesh = mesh_from_file(path)
+        assert len(mesh.triangles) == 1 + len(corners) - 2
+        (surface,) = model_from_file(path)
+        for points, triangles in (
+            (mesh.points, mesh.triangles), (surface.points, surface.triangles)
+        ):  # fmt: skip
+            x, y = np.moveaxis(points[triangles[1:]].astype(np.float64), -1, 0)[:2]
+            seen = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0])
+            seen = (seen - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])) / 2
+            assert ((-seen if turned else seen) >= 0).all()
+            assert abs(seen.sum()) == pytest.approx(area)
+        if path.suffix == ".ply":
+            assert mesh.face_label.tolist() == [7] + [8] * (len(corners) - 2)
+
+
+def test_objects_of_an_obj_may_have_faces_of_other_sizes(tmp_path):
+    """trimesh has those of each object as they are, where they all have as many corners."""
+    path = tmp_path / "mesh.obj"
+    objects = "o three\nf 1 2 3\no four\nf 1 2 3 4\nf 4 3 2 1\no five\nf 1 2 5 3 4\nf 4 3 5 2 1\n"
+    path.write_text(f"{_SQUARE}v 2 0.5 0\n{objects}")
+    mesh = mesh_from_file(path)
+    assert mesh.face_label is not None
+    found = dict(zip(("three", "four", "five"), ([], [], []), strict=True))
+    for label, corners in zip(mesh.face_label.tolist(), mesh.triangles, strict=True):
+        found[mesh.label_names[label]].append(mesh.points[corners, :2].tolist())
+    a, b, c, d, e = [[0, 0], [1, 0], [1, 1], [0, 1], [2, 0.5]]
+    assert found == {
+        "three": [[a, b, c]],
+        "four": [[a, b, c], [a, c, d], [d, c, b], [d, b, a]],
+        "five": [[a, b, e], [a, e, c], [a, c, d], [d, c, e], [d, e, b], [d, b, a]],
+    }
+    assert sum(len(surface.triangles) for surface in model_from_file(path)) == 11
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        lambda text: text.replace("comment", "comment Größe in Metern,").encode("latin-1"),
+        lambda text: text.replace("end_header\n", "end_header\n\n").encode(),
+        lambda text: text.replace("\n", "\r").encode(),
+        lambda text: text.replace("\n", " \r\n").replace(" \r", "\r", 1).encode(),
+        lambda text: text.replace("\n0 1 2", "\n\n  0\t1\n2").encode(),
+    ],
+)
+def test_text_of_ply_may_be_written_in_other_ways(tmp_path, written):
+    text = (
+        "ply\nformat ascii 1.0\ncomment of mine\nelement vertex 3\nproperty float x\n"
+        "property float y\nproperty float z\nelement face 1\n"
+        "property list uchar int vertex_indices\nend_header\n0 1 2\n1 0 0\n1 1 0\n3 0 1 2\n"
+    )
+    (tmp_path / "mesh.ply").write_bytes(written(text))
+    assert mesh_from_file(tmp_path / "mesh.ply").points.tolist() == [
+        [0, 1, 2],
+        [1, 0, 0],
+        [1, 1, 0],
+    ]
+    (surface,) = model_from_file(tmp_path / "mesh.ply")
+    assert surface.triangles.tolist() == [[0, 1, 2]]
+
+
+def test_binary_ply_whose_header_has_lines_of_cr_alone(tmp_path):
+    """Its first number begins with the byte of a LF."""
+    content = _polygons(tmp_path / "a.ply", "<", [[1, 4, 2]])
+    head, body = content.split(b"end_header\n")
+    body = b"\n" + body[1:]
+    (tmp_path / "a.ply").write_bytes(head.replace(b"\n", b"\r") + b"end_header\r" + body)
+    assert mesh_from_file(tmp_path / "a.ply").points[1:3].tolist() == [[1, 0, 0], [1, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("property float y", "property vec y"), "numbers of an unknown kind, 'vec'"),
+        (("1 0 0", "1 zero 0"), "it holds 'zero', which is no number"),
+        (("3 0 1 2\n", "3 0 1 2\n3 0 1 2\n"), "4 numbers more than its header announces"),
+        (("float z", "float w"), "no vertices with x, y and z"),
+        (("end_header", "header ends"), "no end of its header"),
+        (("ascii", "packed"), "its format is 'packed'"),
+        (("element vertex", "element vertex of"), "its header has the line"),
+    ],
+)
+def test_ply_that_says_no_mesh_is_refused_in_our_words(tmp_path, change, words):
+    text = (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0\n1 0 0\n1 1 0\n3 0 1 2\n"
+    )
+    (tmp_path / "mesh.ply").write_text(text.replace(*change))
+    with pytest.raises(InputRefused, match=r"mesh\.ply: .*\[mesh\.read\]$") as refused:
+        mesh_from_file(tmp_path / "mesh.ply")
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize("face", ["f 1 2 9", "f 1/1 2/1 3/1 9/1", "f 9//1 2//1 3//1"])
+def test_the_line_of_an_obj_is_named_whose_vertex_is_not_there(tmp_path, face):
+    path = tmp_path / "mesh.obj"
+    path.write_text(f"{_SQUARE}vt 0 0\nf 1 \\\n 2 3\nf 1 2 3\n{face}\nf 1 3 4\n")
+    with pytest.raises(
+        InputRefused, match=r"line 9: .* vertex 9, but there are 4\..*\[mesh\.index\]$"
+    ):
+        mesh_from_file(path)
 
 
 def test_obj_may_count_its_vertices_back_from_where_a_face_stands(tmp_path):
@@ -137,6 +270,8 @@ def test_obj_may_count_its_vertices_back_from_where_a_face_stands(tmp_path):
         lambda text: text.replace(" ", "  ").replace("\n", " \r\n"),
         lambda text: text.replace("\n", " # of mine\n"),
         lambda text: f"o seat #1\n{text}\n# 4 vertices, 2 faces",
+        lambda text: text.replace("\n", "\r"),
+        lambda text: text.replace("\n", "\n  "),
     ],
 )
 def test_obj_may_be_written_in_other_ways(tmp_path, written):
@@ -226,6 +361,12 @@ _SPARSE = {"count": 1, "indices": {"bufferView": 1, "componentType": 5125}, "val
         ({"accessors": {"sparse": _SPARSE}}, "sparse"),
         ({"accessors": {"componentType": 5122, "normalized": True}}, "quantised"),
         ({"primitive": {"mode": 6}}, "fans"),
+        ({"nodes": {"skin": 0}, "skins": [{"joints": [0]}]}, "its mesh '0' is posed by a skeleton"),
+        (
+            {"meshes": {"name": "face", "weights": [0, 0.5]}, "primitive": {"targets": [{}, {}]}},
+            "its mesh 'face' is shaped by morph targets",
+        ),
+        ({"nodes": {"weights": [1]}, "primitive": {"targets": [{}]}}, "morph targets"),
     ],
 )  # fmt: skip
 def test_glb_whose_geometry_would_be_another_is_refused(tmp_path, changes, words):
@@ -238,6 +379,13 @@ def test_glb_whose_geometry_would_be_another_is_refused(tmp_path, changes, words
         with pytest.raises(InputRefused, match=r"mesh\.glb: .*\[mesh\.format\]$") as refused:
             read(path)
         assert words in str(refused.value)
+
+
+@pytest.mark.parametrize("weights", [{}, {"weights": [0.0]}])
+def test_morph_targets_of_no_weight_leave_a_glb_as_it_is(tmp_path, weights):
+    primitive = {"targets": [{"POSITION": 0}]}
+    _quad_glb(tmp_path / "mesh.glb", primitive=primitive, meshes=weights)
+    assert mesh_from_file(tmp_path / "mesh.glb").triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
 @pytest.mark.fault("G2")
@@ -267,7 +415,7 @@ def test_a_few_broken_faces_are_left_out(tmp_path, broken):
         ("garbage.glb", b"glTF\x02\x00\x00\x00\x10", "mesh.read"),
         ("nothing.obj", b"", "mesh.empty"),
         ("points.obj", _SQUARE.encode(), "mesh.empty"),
-        ("index.obj", (_SQUARE + "f 1 2 9\n").encode(), "mesh.read"),
+        ("index.obj", (_SQUARE + "f 1 2 9\n").encode(), "mesh.index"),
         ("far.obj", b"v 0 0 0\nv 1e9 0 0\nv 0 1 0\nf 1 2 3\n", "mesh.far"),
         ("tiny.obj", b"v 0 0 0\nv 1e-9 0 0\nv 0 1e-9 0\nf 1 2 3\n", "mesh.tiny"),
         ("mesh.stl", b"solid", "mesh.format"),

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 MODULES = {
     "eyeful-tower": "usdbrdf.capture.formats.eyeful_tower",
     "scannetpp": "usdbrdf.capture.formats.scannetpp",
+    "scannet": "usdbrdf.capture.formats.scannet",
     "transforms": "usdbrdf.capture.formats.transforms",
     "scanner-app": "usdbrdf.capture.formats.scanner_app",
     "colmap": "usdbrdf.capture.formats.colmap",
@@ -46,6 +47,7 @@ MODULES = {
 DESCRIPTIONS = {
     "eyeful-tower": "room of Eyeful Tower (cameras.json, images-2k/, mesh.obj)",
     "scannetpp": "scene of ScanNet++ (dslr/, scans/)",
+    "scannet": "scene of ScanNet, unpacked (color/, pose/, intrinsic/, *_vh_clean_2.ply)",
     "transforms": "folder with transforms.json (nerfstudio), scene-linear images and a mesh",
     "scanner-app": 'export folder of "3d Scanner App" (frame_*.json, frame_*.jpg and a mesh)',
     "colmap": "COLMAP model, text or binary, with its images and a mesh",

@@ -88,6 +88,8 @@ _CURES = {
     "capture.camera": "Correct the focal lengths, principal points and distortion.",
     "capture.file": "Copy the missing images, name their folder with --frames, or remove their "
     "entries.",
+    "capture.label": "Give each a label of its own, or put them into camera groups that are called "
+    "as the folders of their pictures, and export the cameras again.",
     "capture.image": "Export the images again as R, G, B float EXR.",
     "capture.alpha": "Leave them out, or export them with what they show opaque.",
     "capture.mask": "Export a mask of the photograph's size for it, or remove its entry.",

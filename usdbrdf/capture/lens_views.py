@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.model.arrays import Bool, Double
-from usdbrdf.model.lens import Lens
+from usdbrdf.model.lens import Lens, whole_sphere
 
 Intrinsics = tuple[float, float, float, float]
 Size = tuple[int, int]
@@ -46,10 +46,16 @@ _FACES = {
 _REACH = math.tan(math.radians(46))
 # Points to a side at which a face is probed; a single frame reaches that far off its axis at most.
 _PROBES = 129
+_ANGLES = 20_001  # at which a lens is probed
 _STEEPEST = math.radians(80)
 # One frame is better than faces with less than half of its pixels.
 _WORTH_FACES = 2.0
 _KEEPS_DETAIL = 0.9
+# What no photograph's distortion does: leave so much of the picture without directions, squeeze the
+# angle of its border to that share, move the border aside by that share of its distance.
+_LEAST_IMAGED, _LEAST_ANGLE, _MOST_ASIDE = 0.25, 0.25, 0.5
+# Of a sphere's width, by which its height may be off half of it.
+_OFF_SPHERE = 0.01
 # A face narrower than that shows no texel.
 _FEWEST_PIXELS = 8
 
@@ -76,6 +82,40 @@ def pinhole_views(lens: Lens, intrinsics: Intrinsics, resolution: Size) -> tuple
         if math.prod(one.resolution) <= _WORTH_FACES * sum(math.prod(v.resolution) for v in views):
             return (one._replace(face=""),)
     return tuple(view for view in views if min(view.resolution) >= _FEWEST_PIXELS)
+
+
+@lru_cache(maxsize=256)
+def why_no_lens(lens: Lens, intrinsics: Intrinsics, resolution: Size) -> str:
+    """Why no photograph of this size has this lens, a clause; "" where it may have it."""
+    fx, fy, cx, cy = intrinsics
+    width, height = resolution
+    said = f"its lens, {lens.described(intrinsics)}, "
+    if lens.curve == "equirectangular":
+        whole = np.allclose(intrinsics, whole_sphere(width, height))
+        if whole and abs(width - 2 * height) > _OFF_SPHERE * width:
+            return f"it has {width} x {height} pixels, which no whole sphere has: it is 2 : 1"
+        return ""
+    if not lens.bends:
+        return ""
+    x, y = np.meshgrid(np.linspace(0, width, _PROBES), np.linspace(0, height, _PROBES))
+    distance = np.hypot((x - cx) / fx, (y - cy) / fy)
+    angles = np.linspace(0, lens.widest_angle, _ANGLES)
+    reached = lens.distance(angles)
+    imaged = float((distance <= reached[-1]).mean())
+    if not imaged >= _LEAST_IMAGED:
+        return f"{said}turns back: {1 - imaged:.0%} of its pixels have no direction"
+    rim = min(float(distance.max()), float(reached[-1]))
+    angle = float(np.interp(rim, reached, angles))
+    plain = np.linspace(0, lens.undistorted.widest_angle, _ANGLES)
+    straight = float(np.interp(rim, lens.undistorted.distance(plain), plain))
+    if not angle >= _LEAST_ANGLE * straight:
+        return (
+            f"{said}shows {math.degrees(angle):.2g} degrees off its axis in the corner, "
+            f"undistorted it would be {math.degrees(straight):.2g}"
+        )
+    if not (aside := lens.aside(angle)) <= _MOST_ASIDE:
+        return f"{said}moves its corners aside by {aside:.2g} times their distance"
+    return ""
 
 
 def views_of(lens: Lens, intrinsics: Intrinsics, resolution: Size) -> tuple[PinholeView, ...]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.checks import Findings, FrameRecord
-from usdbrdf.capture.lens_views import views_of
+from usdbrdf.capture.lens_views import views_of, why_no_lens
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import MAX_SIDE
 from usdbrdf.model.arrays import Double
@@ -46,6 +46,8 @@ def rigid_records(
             size = " x ".join(map(str, record.resolution))
             bends = f" with {record.lens.curve} distortion" if record.lens.bends else ""
             said = f"fx, fy, cx, cy = {lens}{bends} make no lens for {size} pixels"
+            findings.drop(record.name, said, "capture.camera")
+        elif said := why_no_lens(record.lens, record.intrinsics, record.resolution):
             findings.drop(record.name, said, "capture.camera")
         else:
             rigid, off = _made_rigid(pose, record.name, source, pose_scale)

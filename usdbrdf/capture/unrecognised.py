@@ -71,8 +71,25 @@ _PROGRAMS = (
     _Program(
         "Record3D", (), (), rb'"poses"',
         "Make a transforms.json of them with nerfstudio's 'ns-process-data record3d', and a mesh "
-        "in its frame",
+        "of the depths in its frame",
         "metadata.json",
+    ),
+    # "metadata" of one that has been unpacked.
+    _Program(
+        "Record3D", (".r3d",), (), rb'"poses"',
+        "Export EXR and JPG for nerfstudio's 'ns-process-data record3d', and fuse the depths into "
+        "a mesh",
+        "metadata",
+    ),
+    _Program(
+        "ScanNet", (".sens",), (), _NOTHING,
+        "Unpack it here with ScanNet's reader.py (--export_color_images --export_poses "
+        "--export_intrinsics)",
+    ),
+    _Program(
+        "TUM RGB-D", (), (), rb"(?m)\A# ground truth trajectory|^# *timestamp +tx +ty +tz +qx",
+        "Write a transforms.json of the pictures' poses and lens, and fuse the depths into a mesh "
+        "(Open3D)",
     ),
     _Program(
         "Gaussian splatting", (), (), rb'"img_name"',

@@ -4,6 +4,7 @@ and named arrays as an uncompressed .npz without pickles and with fixed bytes.
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import os
@@ -106,7 +107,8 @@ def json_text(obj: Any) -> str:
 
 
 def read_text(path: Path) -> str:
-    """A whole UTF-8 file within ``MAX_BYTES``; InputRefused otherwise."""
+    """A whole file of UTF-8, or of UTF-16 with its mark, within ``MAX_BYTES``; InputRefused
+    otherwise."""
     try:
         if not path.is_file():  # a FIFO or device would block or never end
             raise InputRefused(f"{path}: no such file, or not a regular one. [document.missing]")
@@ -116,7 +118,8 @@ def read_text(path: Path) -> str:
                 f"{path}: {size} bytes, more than the limit of {MAX_BYTES}. Split the capture. "
                 "[document.size]"
             )
-        return path.read_bytes().decode("utf-8-sig")
+        content = path.read_bytes()
+        return content.decode(encoding_of_text(content))
     except OSError as error:
         raise InputRefused(
             f"{path}: cannot be read ({error.strerror}). Check its permissions. [document.missing]"
@@ -125,6 +128,12 @@ def read_text(path: Path) -> str:
         raise InputRefused(
             f"{path}: byte {error.start} is not UTF-8. Save the document as UTF-8. [document.json]"
         ) from error
+
+
+def encoding_of_text(content: bytes) -> str:
+    """What the mark at its beginning says, which spreadsheets write; UTF-8 without one."""
+    marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return "utf-16" if marked else "utf-8-sig"
 
 
 def _parsed(text: str, number: Callable[[str], float]) -> Any:

@@ -21,6 +21,7 @@ import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
+from usdbrdf.files.channels import colours_of
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Bool, Byte, Float
 
@@ -28,7 +29,6 @@ T = TypeVar("T")
 MAX_SIDE = 65_536  # pixels
 MAX_PIXELS = 1 << 28
 MAX_CHANNELS = 64
-_MAX_PARTS = 64  # of one file, which are searched for R, G and B
 MAX_DECLARED_BYTES = 4 << 30
 MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above so many bytes
 _ANY_INFLATION = 1 << 30
@@ -72,18 +72,20 @@ def read_radiance(path: Path, *, max_side: int = MAX_SIDE, alpha: bool = False) 
 
 def _radiance(path: Path, max_side: int, alpha: bool) -> Float:
     source = open_image(path, max_side)
-    names = source.spec().channelnames
-    lower = [name.lower() for name in names]
-    channels = [lower.index(letter) for letter in "rgb" if letter in lower]
-    if len(channels) == 3 and alpha and "a" in lower:
-        channels.append(lower.index("a"))
-    if len(channels) < 3:
-        raise ImageRefused(
-            f"{path}: no channels R, G and B among {', '.join(map(repr, names))}. Export the "
-            "beauty pass as R, G, B. [image.channels]"
-        )
+    with _decoding(path, source, "truncated or damaged", "image.truncated"):
+        colours = colours_of(source)
+    if not isinstance(colours, dict):
+        names = ", ".join(map(repr, colours or source.spec().channelnames))
+        said = f"no channels R, G and B among {names}"
+        if colours:
+            said = (
+                f"{len(colours)} layers have R, G and B ({names}), and not one of them alone is "
+                "called beauty or Combined"
+            )
+        raise ImageRefused(f"{path}: {said}. Export the beauty pass as R, G, B. [image.channels]")
+    channels = [colours[letter] for letter in ("rgba" if alpha else "rgb") if letter in colours]
     pixels = pixels_of(path, source)
-    if channels != list(range(len(names))):
+    if channels != list(range(pixels.shape[2])):
         pixels = pixels[..., channels]
     return _in_display_window(source.spec(), np.ascontiguousarray(pixels))
 
@@ -310,8 +312,8 @@ def _spec_of_preview(path: Path, rgb8: Byte) -> Any:
 
 
 def open_image(path: Path, max_side: int = MAX_SIDE) -> Any:
-    """An OpenImageIO reader on the image of a regular file whose header is within limits: the first
-    part that has R, G and B, or the first if none has."""
+    """An OpenImageIO reader on the image of a regular file whose header is within limits: the
+    part that has its colours (see ``channels``), or the first if none has."""
     return _although_unread_once(path, lambda: _opened(path, max_side))
 
 
@@ -341,7 +343,7 @@ def _opened(path: Path, max_side: int) -> Any:
         source = oiio.ImageInput.open(str(path), hint)
         if source is None:
             raise _Undecoded
-        _seek_colour(source)
+        colours_of(source)  # at whose part it then is
     spec = source.spec()
     if source.format_name() not in _FORMATS or spec.deep or spec.full_depth > 1 or spec.depth > 1:
         raise ImageRefused(
@@ -350,18 +352,6 @@ def _opened(path: Path, max_side: int) -> Any:
         )
     _check_limits(path, spec, status.st_size, max_side)
     return source
-
-
-def _seek_colour(source: Any) -> None:
-    for part in range(_MAX_PARTS):
-        if part and not source.seek_subimage(part, 0):
-            break
-        if {"r", "g", "b"} <= {name.lower() for name in source.spec().channelnames}:
-            return
-    if part:
-        source.geterror()  # that there is no such part
-        if not source.seek_subimage(0, 0):
-            raise _Undecoded
 
 
 class _Undecoded(Exception):

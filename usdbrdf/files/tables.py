@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 from xml.etree import ElementTree
@@ -17,6 +17,7 @@ from usdbrdf.files.documents import (
     DAMAGED_ARRAYS,
     MAX_BYTES,
     MAX_DEPTH,
+    encoding_of_text,
     read_text,
     refusal_of_arrays,
 )
@@ -43,6 +44,12 @@ def beginning_of(path: Path, num_bytes: int = 2000) -> bytes:
         return b""
 
 
+def beginning_of_text(path: Path) -> str:
+    """The same of a text, whatever it is written in."""
+    head = beginning_of(path)
+    return head.decode(encoding_of_text(head), "replace")
+
+
 def number_rows(path: Path) -> tuple[Double, ...]:
     """Each line's numbers, (n,) float64, separated by blanks or commas; lines without any, and
     what follows a #, are passed over. NaN and infinities are for the caller to judge."""
@@ -61,22 +68,64 @@ def number_rows(path: Path) -> tuple[Double, ...]:
     return tuple(rows)
 
 
-def csv_rows(path: Path) -> tuple[dict[str, str], ...]:
-    """Rows of a CSV file by the names of its header, which is the first line with a comma; names
-    lose their case, blanks and a leading #. Comma or semicolon separates."""
-    lines = [line for line in read_text(path).splitlines() if re.search("[,;]", line)]
-    if not lines:
-        raise InputRefused(f"{path}: no table with a header. Export it again. [document.table]")
-    separator = max(",;", key=lines[0].count)
-    table = list(csv.reader(lines, delimiter=separator))
-    names = [name.strip().lstrip("#").strip().lower() for name in table[0]]
-    short = next((row for row in table[1:] if len(row) != len(names)), None)
-    if short is not None:
+def csv_rows(path: Path, names: Collection[str] = ()) -> tuple[dict[str, str], ...]:
+    """Rows of a CSV file by the names of its header, which is the first line that has all of
+    ``names``; these lose their case, blanks and a leading #.
+
+    Commas, semicolons, tabs, or what a first line sep= says separate; numbers may have decimal
+    commas. Empty rows and remarks are passed over: what a # begins, or rows of another length
+    without any number.
+    """
+    lines = read_text(path).splitlines()
+    said = re.match(r"sep=([,;|\t])$", lines[0].strip('\ufeff"'), re.IGNORECASE) if lines else None
+    lines = [line for line in lines[1 if said else 0 :] if line.strip()]
+    try:
+        found = _table(lines, said[1] if said else "", {*names})
+    except csv.Error as error:
         raise InputRefused(
-            f"{path}: the row {separator.join(short)[:60]!r} has {len(short)} values under "
-            f"{len(names)} names. Export it again. [document.table]"
-        )
-    return tuple(dict(zip(names, (v.strip() for v in row), strict=True)) for row in table[1:])
+            f"{path}: not a table ({error}). Export it again. [document.table]"
+        ) from error
+    if found is None:
+        raise InputRefused(f"{path}: no table with a header. Export it again. [document.table]")
+    header, table = found
+    rows = []
+    for row in table:
+        values = [_with_point(value.strip()) for value in row]
+        if len(values) == len(header):
+            if any(values):
+                rows.append(dict(zip(header, values, strict=True)))
+        elif not values[0].startswith("#") and any(map(_is_number, values)):
+            raise InputRefused(
+                f"{path}: the row {', '.join(row)[:60]!r} has {len(row)} values under "
+                f"{len(header)} names. Export it again. [document.table]"
+            )
+    return tuple(rows)
+
+
+def _table(
+    lines: Sequence[str], separator: str, names: Collection[str]
+) -> tuple[list[str], list[list[str]]] | None:
+    """The names of a header and the rows below it; None without one."""
+    for i, line in enumerate(lines):
+        by = separator or max(_SEPARATORS, key=line.count)
+        header = [name.strip(" #").lower() for name in next(csv.reader([line], delimiter=by))]
+        if by in line and set(names) <= set(header):
+            return header, [row for row in csv.reader(lines[i + 1 :], delimiter=by) if row]
+    return None
+
+
+_SEPARATORS = ",;\t"
+
+
+def _with_point(value: str) -> str:
+    return value.replace(",", ".") if re.fullmatch(_DECIMAL_COMMA, value) else value
+
+
+_DECIMAL_COMMA = r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?"
+
+
+def _is_number(value: str) -> bool:
+    return number_in({"": value}, "") is not None
 
 
 def read_xml(path: Path) -> Element:

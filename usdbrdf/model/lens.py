@@ -18,6 +18,7 @@ _SHAPE = {"fov": ("omega",), "division": ("k",), "eucm": ("alpha", "beta")}
 _MOST_RADIAL = 8
 # Angles between 0 and a half turn at which a curve is looked at for where it turns back.
 _ANGLES = 20_001
+_AROUND = 33
 _TINY = 1e-12
 
 
@@ -116,6 +117,26 @@ class Lens:
         """Radians off the axis up to which a larger angle means a larger radius."""
         return _widest_angle(self)
 
+    @property
+    def undistorted(self) -> Lens:
+        """The curve alone."""
+        return Lens(curve=self.curve, shape=self.shape)
+
+    def distance(self, angle: Double) -> Double:
+        """r R of t: how far off the middle of the plane the radial terms image a direction."""
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            radius = self._radius(angle)
+            return np.asarray(radius * self._stretch(radius**2))
+
+    def aside(self, angle: float) -> float:
+        """How far the other terms move what is imaged at the angle, in parts of its distance."""
+        around = np.linspace(0, 2 * np.pi, _AROUND)
+        azimuth = np.stack([np.cos(around), np.sin(around)], axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            moved = self._distorted(azimuth * self._radius(np.array(angle)))
+            off = moved - azimuth * self.distance(np.array(angle))
+            return float(np.linalg.norm(off, axis=-1).max() / self.distance(np.array(angle)))
+
     def _radius(self, angle: Double) -> Double:
         """r of t; NaN where the curve ends."""
         sine, cosine = np.sin(angle), np.cos(angle)
@@ -165,11 +186,9 @@ def _widest_angle(lens: Lens) -> float:
     if lens.curve == "equirectangular":
         return float(np.pi)
     angles = np.linspace(0, np.pi, _ANGLES)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        radius = lens._radius(angles)
-        radius = radius * lens._stretch(radius**2)
     # NaN is no step outwards either.
-    inwards = np.flatnonzero(~(np.diff(radius) > 0))
+    with np.errstate(invalid="ignore"):
+        inwards = np.flatnonzero(~(np.diff(lens.distance(angles)) > 0))
     return float(angles[inwards[0] if len(inwards) else -1])
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
+from usdbrdf.model.polygons import ears, fans_that_leave
 
 # What a person may ask about an object: of shading, of the fit; and what is then not fitted.
 LAMP, METAL, GLASS, REFIT = "lamp", "metal", "glass", "refit"
@@ -117,12 +118,19 @@ class Triangulation:
 
 
 def triangulate(
-    counts: Int, indices: Int, *, left_handed: bool = False, holes: Int | None = None
+    counts: Int | Long,
+    indices: Int | Long,
+    *,
+    left_handed: bool = False,
+    holes: Int | None = None,
+    points: Array | None = None,
 ) -> Triangulation:
     """Fans from each polygon's first corner; polygons that are holes or have no area disappear.
 
     counts   (P,) corners per polygon
     indices  (C,) point of each corner
+    points   (V, 3): where they are given, polygons whose fan would leave them are cut otherwise, in
+             as many triangles; indices are inside [0, V) then
     """
     counts = np.asarray(counts, np.int64)
     fans = np.maximum(counts - 2, 0)
@@ -130,12 +138,18 @@ def triangulate(
         fans[np.asarray(holes)] = 0
     polygon = np.repeat(np.arange(len(counts)), fans)
     in_fan = np.arange(len(polygon)) - np.repeat(np.cumsum(fans) - fans, fans)
-    first = (np.cumsum(counts) - counts)[polygon]
+    firsts = np.cumsum(counts) - counts
+    first = firsts[polygon]
     corners = np.stack([first, first + in_fan + 1, first + in_fan + 2], axis=-1)
+    indices = np.asarray(indices, np.int32)
+    if points is not None:
+        for i in fans_that_leave(points, indices[corners], polygon).tolist():
+            own = indices[firsts[i] : firsts[i] + counts[i]]
+            corners[slice(*np.searchsorted(polygon, (i, i + 1)))] = firsts[i] + ears(points[own])
     if left_handed:
         corners = corners[:, [0, 2, 1]]
     return Triangulation(
-        triangles=np.asarray(indices, np.int32)[corners].reshape(-1, 3),
+        triangles=indices[corners].reshape(-1, 3),
         corners=corners.astype(np.int32),
         polygon=polygon.astype(np.int32),
     )

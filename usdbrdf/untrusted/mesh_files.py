@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -42,7 +43,8 @@ from usdbrdf.untrusted.mesh_gltf import (
     unread,
     with_numbered_materials,
 )
-from usdbrdf.untrusted.mesh_text import binary_ply_of_polygons, obj_counted_forwards
+from usdbrdf.untrusted.mesh_ply import ply_of
+from usdbrdf.untrusted.mesh_text import missing_vertex, obj_of_convex_faces, plain_obj
 
 SUFFIXES = (".ply", ".obj", ".glb")
 # The face property by which the objects of a segmented PLY are told apart.
@@ -79,7 +81,7 @@ class FileMesh:
 def mesh_from_file(path: Path) -> FileMesh:
     """Read and check a mesh; vertices are neither merged, reordered nor moved.
 
-    Quads become two triangles each, in place, and hand their label to both.
+    Faces of more corners become triangles, in place, and hand their label to all of them.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise InputRefused(
@@ -129,8 +131,7 @@ def _parsed(path: Path, read: Callable[[BinaryIO], Any]) -> Any:
             raise EnvironmentFailure(f"{path}: cannot be read ({error}). [mesh.read]") from error
         raise InputRefused(
             f"{path}: damaged or no {path.suffix[1:].upper()} mesh ({type(error).__name__}: "
-            f"{' '.join(str(error).split())[:160]}). Export it again; a face must have three or "
-            "four corners. [mesh.read]"
+            f"{' '.join(str(error).split())[:160]}). Export it again. [mesh.read]"
         ) from error
 
 
@@ -188,38 +189,37 @@ def _refuse_if_many(path: Path, broken: Bool, what: str, rule: str) -> None:
 
 
 def _mesh_from_ply(file: BinaryIO) -> FileMesh:
-    try:
-        # Where corners have texture coordinates trimesh would part vertices, and join others.
-        arrays: dict[str, Any] = load_ply(file, fix_texture=False)
-    except ValueError:
-        # Which is also what it says of triangles beside quads, if they are binary.
-        points, triangles, numbers = binary_ply_of_polygons(file)
-        label = numbers.get(LABEL_PROPERTY)
-        return _file_mesh(points, triangles, None if label is None else label.astype(np.int64))
-    elements = arrays["metadata"]["_ply_raw"]
-    if "vertices" not in arrays or arrays.get("faces") is None:
-        return _no_faces(len(arrays.get("vertices", ())))
-    data = elements["face"]["data"]
-    stored = np.asarray(arrays["faces"])
-    columns = data if isinstance(data, dict) else {name: data[name] for name in data.dtype.names}
-    label = None
-    if LABEL_PROPERTY in columns:
-        label = np.asarray(columns[LABEL_PROPERTY]).reshape(-1).astype(np.int64)
-    expected = {name: int(elements[name]["length"]) for name in ("vertex", "face")}
-    held = {"vertex": len(arrays["vertices"]), "face": len(next(iter(columns.values())))}
-    if held != expected:  # an ASCII file that ends early reads as a shorter one
-        raise ValueError(f"the header announces {expected}, the file holds less")
-    if label is not None and len(label) != len(stored):
-        raise ValueError("labelled faces must all have the same number of corners")
-    return _file_mesh(arrays["vertices"], stored, label)
+    ply = ply_of(file.read())
+    cut, label = ply.triangulation, ply.faces.get(LABEL_PROPERTY)
+    label = None if label is None else label.astype(np.int64)[cut.polygon]
+    return _file_mesh(ply.points, cut.triangles, label)
 
 
 def _mesh_from_obj(file: BinaryIO) -> FileMesh:
-    loaded: dict[str, Any] = load_obj(
-        obj_counted_forwards(file), skip_materials=True, maintain_order=True, split_objects=True
-    )
+    content = plain_obj(file.read())
+    try:
+        loaded: dict[str, Any] = load_obj(
+            BytesIO(obj_of_convex_faces(content)),
+            skip_materials=True,
+            maintain_order=True,
+            split_objects=True,
+        )
+    except IndexError as error:
+        if said := missing_vertex(content):
+            raise InputRefused(
+                f"{file.name}: {said}. Export it again, or correct this line. [mesh.index]"
+            ) from error
+        raise
     parts = loaded.get("geometry", {})
-    return _joined([(name, p["vertices"], p["faces"]) for name, p in parts.items()])
+    return _joined([(name, p["vertices"], _fans(p["faces"])) for name, p in parts.items()])
+
+
+def _fans(faces: Any) -> Any:
+    """(T, 3) triangles in place of faces (F, N) that all have as many corners."""
+    polygons = np.asarray(faces)
+    steps = np.arange(polygons.shape[1] - 2)
+    fan = np.stack([np.zeros_like(steps), steps + 1, steps + 2], axis=1)
+    return polygons[:, fan].reshape(-1, 3)
 
 
 def _refuse_promises(file: BinaryIO) -> dict[str, Any]:
@@ -245,7 +245,7 @@ def _mesh_from_glb(file: BinaryIO) -> FileMesh:
     if said := geometry_not_read(_refuse_promises(file)):
         raise InputRefused(
             f"{file.name}: {said}, which is not read here. Export it again as plain triangles, "
-            "without compression, or convert it to PLY. [mesh.format]"
+            "posed and without compression, or convert it to PLY. [mesh.format]"
         )
     scene = trimesh.load_scene(file, file_type="glb", process=False)
     parts = []
@@ -276,11 +276,8 @@ def _joined(parts: list[tuple[str, Any, Any]]) -> FileMesh:
 
 def _file_mesh(points: Any, faces: Any, label: Any = None, names: tuple[str, ...] = ()) -> FileMesh:
     polygons = np.asarray(faces, np.int64)
-    if polygons.ndim != 2 or polygons.shape[1] not in (3, 4):
+    if polygons.ndim != 2 or polygons.shape[1] != 3:
         raise ValueError(f"faces have the shape {polygons.shape}")
-    if polygons.shape[1] == 4:
-        polygons = polygons[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-        label = None if label is None else np.repeat(label, 2)
     # Unsigned indices beyond int32 must not wrap round to valid ones.
     polygons = np.where(polygons > np.iinfo(np.int32).max, -1, polygons)
     return FileMesh(
@@ -314,7 +311,9 @@ def _surfaces(path: Path, file: BinaryIO) -> tuple[list[Surface], list[str]]:
     beside = _FilesBeside(path)
     load: Any = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}[path.suffix.lower()]
     if path.suffix.lower() == ".obj":
-        file = obj_counted_forwards(file)
+        file = BytesIO(obj_of_convex_faces(plain_obj(file.read())))
+    if path.suffix.lower() == ".ply":
+        file = ply_of(file.read()).as_trimesh_reads_it()
     gltf = None
     if path.suffix.lower() == ".glb":
         file, gltf = with_numbered_materials(file)
@@ -328,6 +327,8 @@ def _surfaces(path: Path, file: BinaryIO) -> tuple[list[Surface], list[str]]:
     colours = [None if gltf is None else taken_colours(mesh) for mesh in meshes]
     for mesh in meshes:
         mesh["process"] = False
+        if "faces" in mesh:
+            mesh["faces"] = _fans(mesh["faces"])
     scene = trimesh.load_scene(stored)
     given = dict(zip(scene.geometry, zip(normals, colours, strict=True), strict=True))
     found = []

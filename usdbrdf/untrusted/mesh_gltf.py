@@ -39,6 +39,9 @@ def geometry_not_read(document: dict[str, Any]) -> str:
         return "its vertices are compressed (meshopt)"
     if any(_INSTANCES in node.get("extensions", {}) for node in document.get("nodes", ())):
         return f"it has copies of meshes ({_INSTANCES})"
+    for node in document.get("nodes", ()):
+        if "mesh" in node and (bent := _bent(node, document["meshes"][node["mesh"]])):
+            return bent
     accessors = document.get("accessors", ())
     for primitive in (p for mesh in document.get("meshes", ()) for p in mesh["primitives"]):
         points = primitive["attributes"].get("POSITION")
@@ -51,6 +54,17 @@ def geometry_not_read(document: dict[str, Any]) -> str:
             return "its vertices are quantised and normalised"
         if primitive.get("mode") == _FAN:
             return "it has fans of triangles"
+    return ""
+
+
+def _bent(node: dict[str, Any], mesh: dict[str, Any]) -> str:
+    """By what a mesh has another shape than its vertices say; a skin also moves it from its node.
+    Morph targets of no weight change nothing."""
+    name = _name(mesh, node["mesh"])
+    if "skin" in node:
+        return f"its mesh {name} is posed by a skeleton (skin)"
+    if any(node.get("weights", mesh.get("weights", ()))):
+        return f"its mesh {name} is shaped by morph targets"
     return ""
 
 

@@ -1,52 +1,66 @@
-"""What trimesh makes something else of than PLY and OBJ files say: polygons of several sizes in a
-binary PLY, and vertices that an OBJ counts backwards or writes in other ways than most."""
+"""What trimesh makes something else of than OBJ files say: vertices that are counted backwards,
+faces of more than three corners, and lines that are written in other ways than most."""
 
 from __future__ import annotations
 
 import codecs
 import re
-import struct
-from io import BytesIO
-from typing import Any, BinaryIO
 
 import numpy as np
 
-_BACKWARDS = re.compile(rb"^[ \t]*f[ \t][^\n]*[ \t]-\d", re.MULTILINE)
-_NOUGHT = re.compile(rb"^[ \t]*f[ \t](?:[^\n]*[ \t])?0+[/ \t\r\n]", re.MULTILINE)
+from usdbrdf.model.mesh import triangulate
+from usdbrdf.model.polygons import ears, fans_that_leave
+
+_BACKWARDS = re.compile(rb"^f [^\n]*[ ]-\d", re.MULTILINE)
+_NOUGHT = re.compile(rb"^f (?:[^\n]*[ ])?0+[/ \n]", re.MULTILINE)
 _REMARK = re.compile(rb"^([ ]*(?:v[tn]?|f) [^\n#]*)#[^\n]*", re.MULTILINE)
-# PLY's names of numbers, as struct spells them.
-_KINDS = {
-    "char": "b", "int8": "b", "uchar": "B", "uint8": "B", "short": "h", "int16": "h",
-    "ushort": "H", "uint16": "H", "int": "i", "int32": "i", "uint": "I", "uint32": "I",
-    "float": "f", "float32": "f", "double": "d", "float64": "d",
-}  # fmt: skip
-_LONGEST_HEADER = 1 << 16
+_POLYGON = re.compile(rb"^f(?: +[^ \n]+){4}", re.MULTILINE)
+# A line that goes on in the next, as often as it does.
+_CONTINUED = re.compile(rb"^(?:[^\n]*\\\n)+[^\n]*", re.MULTILINE)
 
 
-def obj_counted_forwards(file: BinaryIO) -> BinaryIO:
-    """An OBJ all of whose faces count vertices from the first one on. Its format lets them count
-    back from where they stand; trimesh would count from the end of the file. It would also pass
-    over lines whose words tabs part, or that a mark of UTF-8 begins, and stumble over remarks.
+def plain_obj(content: bytes) -> bytes:
+    """An OBJ all of whose faces count vertices from the first one on, line by line. Its format lets
+    them count back from where they stand; trimesh would count from the end of the file. It would
+    also pass over lines whose words tabs part, that are indented, that a CR alone ends or that a
+    mark of UTF-8 begins, and stumble over remarks.
 
     Raises ValueError for a vertex 0, which would be taken for the last one.
     """
-    content = file.read().removeprefix(codecs.BOM_UTF8).replace(b"\t", b" ")
+    content = content.removeprefix(codecs.BOM_UTF8).replace(b"\t", b" ") + b"\n"
+    if b"\r" in content:
+        content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if b"\\\n" in content:
+        content = _CONTINUED.sub(_in_one_line, content)
+    if b"\n " in content or content[:1] == b" ":
+        content = re.sub(rb"^ +", b"", content, flags=re.MULTILINE)
     if b" #" in content:
         content = _REMARK.sub(rb"\1", content)
-    if _NOUGHT.search(content):
-        raise ValueError("a face has a vertex 0, but OBJ counts from 1")
-    if not _BACKWARDS.search(content):
-        return BytesIO(content)
+    if found := _NOUGHT.search(content):
+        line = content.count(b"\n", 0, found.start()) + 1
+        raise ValueError(f"line {line}: a face has a vertex 0, but OBJ counts from 1")
+    return _counted_forwards(content) if _BACKWARDS.search(content) else content
+
+
+def _in_one_line(found: re.Match[bytes]) -> bytes:
+    """With empty lines behind it, so that the next one keeps its number."""
+    lines = found[0].split(b"\\\n")
+    return b" ".join(lines) + b"\n" * (len(lines) - 1)
+
+
+def _counted_forwards(content: bytes) -> bytes:
     there = {b"v": 0, b"vt": 0, b"vn": 0}
-    lines = []
-    for line in re.sub(rb"\\\r?\n", b" ", content).splitlines():
+    lines = content.split(b"\n")
+    for i, line in enumerate(lines):
         key, *rest = line.split() or [b""]
         if key in there:
             there[key] += 1
         elif key == b"f":
-            line = b" ".join([key, *(_forwards(corner, there) for corner in rest)])
-        lines.append(line)
-    return BytesIO(b"\n".join(lines) + b"\n")
+            try:
+                lines[i] = b" ".join([key, *(_forwards(corner, there) for corner in rest)])
+            except ValueError as error:
+                raise ValueError(f"line {i + 1}: {error}") from error
+    return b"\n".join(lines)
 
 
 def _forwards(corner: bytes, there: dict[bytes, int]) -> bytes:
@@ -61,88 +75,44 @@ def _forwards(corner: bytes, there: dict[bytes, int]) -> bytes:
     return b"/".join(counted)
 
 
-def binary_ply_of_polygons(file: BinaryIO) -> tuple[Any, Any, dict[str, Any]]:
-    """Points (V, 3), triangles (F, 3) and the other single numbers of each triangle's face, by
-    name, of a binary PLY whose faces have three or four corners each.
+def obj_of_convex_faces(content: bytes) -> bytes:
+    """A plain OBJ whose faces that a fan from their first corner would leave have become triangles,
+    in place: trimesh makes fans of all.
 
-    Raises ValueError for what is none, or ends early.
+    Raises IndexError where faces of more than three corners have vertices that do not exist.
     """
-    file.seek(0)
-    content = file.read()
-    end = re.search(rb"end_header\r?\n", content[:_LONGEST_HEADER])
-    if end is None:
-        raise ValueError("no end of its header")
-    header = content[: end.start()].decode("ascii", "replace").splitlines()
-    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(
-        next((line.split()[1] for line in header if line.startswith("format ")), "")
-    )
-    if order is None:
-        raise ValueError("it is no binary PLY")
-    elements: list[tuple[str, int, list[list[str]]]] = []
-    for words in (line.split() for line in header):
-        if words[:1] == ["element"]:
-            elements.append((words[1], int(words[2]), []))
-        elif words[:1] == ["property"]:
-            elements[-1][2].append(words[1:])
-    place, points, faces = end.end(), None, None
-    for name, count, properties in elements:
-        if not 0 <= count <= len(content):
-            raise ValueError(f"it announces {count} elements {name!r} in {len(content)} bytes")
-        if name == "face":
-            faces, place = _faces(content, place, count, properties, order)
-            continue
-        if any(words[0] == "list" for words in properties):
-            raise ValueError(f"the element {name!r} has lists")
-        row = np.dtype([(words[1], order + _KINDS[words[0]]) for words in properties])
-        if place + count * row.itemsize > len(content):
-            raise ValueError(f"it ends before its {count} elements {name!r}")
-        if name == "vertex":
-            rows = np.frombuffer(content, row, count, place)
-            points = np.column_stack([rows[axis] for axis in "xyz"])
-        place += count * row.itemsize
-    if points is None or faces is None:
-        raise ValueError("no vertices or no faces")
-    return points, *faces
+    if not _POLYGON.search(content):
+        return content
+    lines = content.split(b"\n")
+    rows = [b" ".join(line.split(None, 4)[1:4]) for line in lines if line[:2] == b"v "]
+    points = np.fromstring(b" ".join(rows), np.float64, sep=" ").reshape(len(rows), 3)
+    places = [i for i, line in enumerate(lines) if line[:2] == b"f " and len(line.split()) > 4]
+    text = b" ".join(lines[i][2:] for i in places)
+    if b"/" in text:
+        text = re.sub(rb"/[^ ]*", b"", text)
+    corners = np.fromstring(text, np.int64, sep=" ") - 1
+    if corners.max() >= len(points):
+        raise IndexError("a face has a vertex that does not exist")
+    counts = np.array([len(lines[i].split()) - 1 for i in places], np.int64)
+    cut = triangulate(counts, corners)
+    firsts = np.cumsum(counts) - counts
+    for face in fans_that_leave(points, cut.triangles, cut.polygon).tolist():
+        words = lines[places[face]].split()[1:]
+        own = corners[firsts[face] : firsts[face] + counts[face]]
+        lines[places[face]] = b"\n".join(
+            b" ".join([b"f", *(words[corner] for corner in ear)])
+            for ear in ears(points[own]).tolist()
+        )
+    return b"\n".join(lines)
 
 
-def _faces(
-    content: bytes, place: int, count: int, properties: list[list[str]], order: str
-) -> tuple[tuple[Any, dict[str, Any]], int]:
-    """Triangles and their faces' numbers, and where the element ends."""
-    triangles: list[tuple[int, ...]] = []
-    numbers: dict[str, list[Any]] = {words[1]: [] for words in properties if words[0] != "list"}
-    single = {k: struct.Struct(order + k) for k in set(_KINDS.values())}
-    for _ in range(count):
-        pieces, said = 1, {}
-        for words in properties:
-            if words[0] != "list":
-                kind = single[_KINDS[words[0]]]
-                said[words[1]] = _unpacked(kind, content, place)[0]
-                place += kind.size
-                continue
-            kind = single[_KINDS[words[1]]]
-            (corners,) = _unpacked(kind, content, place)
-            place += kind.size
-            size = single[_KINDS[words[2]]].size
-            if words[3] in ("vertex_indices", "vertex_index"):
-                if corners not in (3, 4):
-                    raise ValueError(f"a face has {corners} corners")
-                row = struct.unpack_from(f"{order}{corners}{_KINDS[words[2]]}", content, place)
-                triangles.append(row[:3])
-                if corners == 4:
-                    triangles.append((row[0], row[2], row[3]))
-                    pieces = 2
-            elif corners < 0:
-                raise ValueError(f"a list has {corners} elements")
-            place += int(corners) * size
-        for name, number in said.items():
-            numbers[name] += [number] * pieces
-    if place > len(content):
-        raise ValueError("it ends before its last face")
-    return (np.array(triangles).reshape(-1, 3), {k: np.array(v) for k, v in numbers.items()}), place
-
-
-def _unpacked(kind: struct.Struct, content: bytes, place: int) -> tuple[Any, ...]:
-    if place + kind.size > len(content):
-        raise ValueError("it ends within a face")
-    return kind.unpack_from(content, place)
+def missing_vertex(content: bytes) -> str:
+    """Where the first face of a plain OBJ stands that has a vertex beyond the last, "" for none."""
+    lines = content.split(b"\n")
+    there = sum(line[:2] == b"v " for line in lines)
+    for i, line in enumerate(lines):
+        for word in line.split()[1:] if line[:2] == b"f " else ():
+            number = word.split(b"/", 1)[0]
+            if number.isdigit() and int(number) > there:
+                return f"line {i + 1}: a face has the vertex {int(number)}, but there are {there}"
+    return ""

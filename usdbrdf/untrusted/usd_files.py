@@ -249,7 +249,8 @@ def _is_shown(shape: UsdGeom.Imageable) -> bool:
 
 def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
     """Visible meshes in the order of the stage, and sentences about the rest."""
-    meshes, other, hidden = [], [], 0
+    meshes, empty = list[UsdGeom.Mesh](), list[UsdGeom.Mesh]()
+    other, hidden = [], 0
     for prim in Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)):
         if prim.IsA(UsdGeom.PointInstancer):
             raise InputRefused(
@@ -261,15 +262,30 @@ def _meshes_below(root: Any, path: Path) -> tuple[list[Any], list[str]]:
         if not _is_shown(UsdGeom.Imageable(prim)):
             hidden += 1
         elif prim.IsA(UsdGeom.Mesh):
-            meshes.append(UsdGeom.Mesh(prim))
+            mesh = UsdGeom.Mesh(prim)
+            (empty if _is_empty(mesh) else meshes).append(mesh)
         else:
             other.append(f"<{prim.GetPath()}> ({prim.GetTypeName()})")
     if not meshes:
+        held = "no visible mesh with faces" if empty else "no visible mesh"
         raise InputRefused(
-            f"{path}: no visible mesh below <{root.GetPath()}>. Export the surface as meshes "
+            f"{path}: {held} below <{root.GetPath()}>. Export the surface as meshes "
             "inside the default prim, or name a mesh with --mesh. [mesh.empty]"
         )
-    return meshes, _warnings(path.name, root, meshes, other, hidden)
+    sentences = _warnings(path.name, root, meshes, other, hidden)
+    if empty:
+        sentences.append(
+            f"{path.name}: {len(empty)} meshes have no faces and are left out, first "
+            f"<{empty[0].GetPath()}>. [stage.empty]"
+        )
+    return meshes, sentences
+
+
+def _is_empty(mesh: UsdGeom.Mesh) -> bool:
+    """Whether nothing is said of faces at all, as exporters leave what has been deleted."""
+    time = Usd.TimeCode.EarliestTime()
+    said = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+    return not any(attribute.Get(time) for attribute in said)
 
 
 def _warnings(

@@ -7,6 +7,7 @@ their sensors say, seen from the master's. Principal points are offsets from the
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -119,12 +120,7 @@ def frame_records(
     source: Path, pictures: Pictures, options: CaptureOptions, findings: Findings
 ) -> list[FrameRecord]:
     """The cameras of a document that have a pose and a picture, by their labels."""
-    chunk = read_xml(source).find("chunk")
-    if chunk is None or chunk.find("sensors") is None or chunk.find("cameras") is None:
-        raise InputRefused(
-            f"{source}: no chunk with sensors and cameras. Export the cameras again. "
-            "[capture.format]"
-        )
+    chunk = _chunk(read_xml(source), source, findings)
     sensors = {s.get("id", ""): _sensor(s, source) for s in chunk.iterfind("sensors/sensor")}
     place_of = _places(chunk, source, findings)
     cameras = list(chunk.iterfind("cameras//camera"))
@@ -136,6 +132,8 @@ def frame_records(
     # Pictures of one name in several folders are told apart by the groups that they are in.
     group_of = {c: g.get("label", "") for g in chunk.iterfind("cameras/group") for c in g}
     chunk_from_camera = {c.get("id", ""): numbers_of(c.find("transform"), 16) for c in cameras}
+    shared = Counter(camera.get("label", "") for camera in filter(_is_enabled, cameras))
+    names_of: dict[Path, list[str]] = {}
     records = []
     for camera in cameras:
         label = camera.get("label", "")
@@ -149,9 +147,14 @@ def frame_records(
             findings.drop(label, why, "capture.alignment")
             continue
         image = pictures.named(f"{group_of.get(camera, '')}/{label}") or pictures.named(label)
+        if image is None and shared[label] > 1:
+            said = f"{shared[label]} cameras have this label, and no picture or several this name"
+            findings.drop(label, said, "capture.label")
+            continue
         if image is None:
             drop_without_picture(label, findings)
             continue
+        names_of.setdefault(image, []).append(label)
         pose = place_of(camera).pose(master.reshape(4, 4) @ sensor.master_from_sensor)
         records.append(
             FrameRecord(
@@ -164,7 +167,34 @@ def frame_records(
                 mask_path=pictures.mask_of(image, source.parent, options),
             )
         )
-    return sorted(records, key=lambda record: record.image_path)
+    for names in (some for some in names_of.values() if len(some) > 1):
+        for name in names:
+            said = f"{len(names)} cameras have this label and one picture, which may be of any"
+            findings.drop(name, said, "capture.label")
+    known = (r for r in records if len(names_of[r.image_path]) == 1)
+    return sorted(known, key=lambda record: record.image_path)
+
+
+def _chunk(document: Element, source: Path, findings: Findings) -> Element:
+    """The first chunk that has cameras, of those that are enabled if one of these has."""
+    chunks = list(document.iterfind("chunk"))
+    full = [
+        c for c in chunks if c.find("sensors") is not None and c.find("cameras//camera") is not None
+    ]
+    if not full:
+        held = "no chunk" if len(chunks) < 2 else f"{len(chunks)} chunks, but none"
+        raise InputRefused(
+            f"{source}: {held} with sensors and cameras. Make the chunk with the aligned cameras "
+            "the active one, and export the cameras again. [capture.format]"
+        )
+    chosen = next(filter(_is_enabled, full), full[0])
+    if len(full) > 1:
+        findings.warn(
+            f"{source.name}: {len(full)} chunks have cameras; those of the chunk "
+            f"{chosen.get('label', '')!r} are read. Export the chunk of the model alone if that is "
+            "another. [capture.chunk]"
+        )
+    return chosen
 
 
 def _is_enabled(camera: Element) -> bool:

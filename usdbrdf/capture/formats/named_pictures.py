@@ -24,6 +24,7 @@ from usdbrdf.capture.parts import (
     scan_from_parts,
 )
 from usdbrdf.errors import ImageRefused, InputRefused, UsageError
+from usdbrdf.files.channels import layers_with_colours
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, image_size
 from usdbrdf.files.paths import contained
@@ -198,7 +199,7 @@ def _in_colours(found: Sequence[Path]) -> Sequence[Path]:
 
 def _has_colours(path: Path) -> bool:
     try:
-        return {"r", "g", "b"} <= {name.lower() for name in image_size(path)[2]}
+        return bool(layers_with_colours(image_size(path)[2]))
     except ImageRefused:  # of which the reader of its pixels will tell
         return True
 

@@ -36,7 +36,15 @@ from usdbrdf.capture.formats.named_pictures import (
 )
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
-from usdbrdf.files.tables import Element, beginning_of, csv_rows, files_of, number_in, read_xml
+from usdbrdf.files.tables import (
+    Element,
+    beginning_of,
+    beginning_of_text,
+    csv_rows,
+    files_of,
+    number_in,
+    read_xml,
+)
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Lens
@@ -46,6 +54,7 @@ NAME = "realityscan"
 DESCRIPTION = DESCRIPTIONS[NAME]
 _NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 _DESCRIBED = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
+_COLUMNS = frozenset(("name", "x", "y", "alt"))
 _FULL_FRAME_MM = 36.0
 _EXPORT = 'Export the registration as "Internal/External camera parameters"'
 
@@ -60,10 +69,9 @@ def _tables(path: Path) -> list[Path]:
 
 
 def _is_table(file: Path) -> bool:
-    # What a spreadsheet has saved begins with a mark of UTF-8.
-    lines = beginning_of(file).decode("utf-8-sig", "replace").lower().splitlines()
-    first = next((line for line in lines if re.search("[,;]", line)), "")
-    return {"name", "x", "y", "alt"} <= {word.strip(" #") for word in re.split("[,;]", first)}
+    lines = beginning_of_text(file).lower().splitlines()
+    words = ({word.strip(' #"') for word in re.split("[,;\t]", line)} for line in lines)
+    return any(words >= _COLUMNS for words in words)
 
 
 def _sidecars(path: Path) -> list[Path]:
@@ -115,7 +123,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 
 def records_of_table(source: Path, pictures: Pictures, findings: Findings) -> Iterator[FrameRecord]:
     """The cameras of a CSV export that have a picture."""
-    for row in csv_rows(source):
+    for row in csv_rows(source, _COLUMNS):
         name = row.get("name", "")
         place = [number_in(row, axis) for axis in ("x", "y", "alt")]
         angles = [number_in(row, *names) for names in (("heading", "yaw"), ("pitch",), ("roll",))]

@@ -1,17 +1,12 @@
 """ScanNet++: the photographs of dslr/ with the laser scan and the objects of scans/.
 
-dslr/colmap and the mesh share a frame; transforms.json beside it has its axes changed. Objects are
-groups of segments, and each vertex of the mesh is in one segment.
+dslr/colmap and the mesh share a frame; transforms.json beside it has its axes changed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
@@ -24,15 +19,11 @@ from usdbrdf.capture.formats.named_pictures import (
     scan_of,
     warn_of_radiance,
 )
-from usdbrdf.capture.parts import LabelTable
+from usdbrdf.capture.formats.scannet_objects import annotated_objects
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.documents import read_json
-from usdbrdf.model.arrays import Int, Long
 from usdbrdf.model.capture import Scan
-from usdbrdf.model.mesh import ObjectName
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import colmap_model, model_files
-from usdbrdf.untrusted.mesh_files import FileMesh
 
 NAME = "scannetpp"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -78,6 +69,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         )
     warn_of_radiance(pictures.instead, findings, source)
     records.sort(key=lambda record: record.image_path)
+    scans = folder / "scans"
     mesh = partial(
         mesh_beside, folder, options, f"scans/{_MESH}", how=f"Download scans/{_MESH} of this scene"
     )
@@ -90,55 +82,5 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         source=source,
         folder=folder,
         name=folder.name,
-        objects=_annotated(folder / "scans"),
+        objects=annotated_objects(scans / "segments.json", scans / "segments_anno.json"),
     )
-
-
-def _annotated(scans: Path) -> Callable[[FileMesh], LabelTable] | None:
-    """What knows the objects by segments.json and segments_anno.json; None without these."""
-    segments, groups = scans / "segments.json", scans / "segments_anno.json"
-    if not (segments.is_file() and groups.is_file()):
-        return None
-
-    def objects(mesh: FileMesh) -> LabelTable:
-        document: Any = read_json(segments)
-        numbers = document.get("segIndices") if isinstance(document, dict) else None
-        if not isinstance(numbers, list) or len(numbers) != len(mesh.points):
-            raise InputRefused(
-                f"{segments}: no segIndices for each of the {len(mesh.points)} vertices of "
-                f"{_MESH}. Download both of one scene. [objects.count]"
-            )
-        entries, object_of_segment = _groups(groups)
-        of_vertex = np.array([object_of_segment.get(number, -1) for number in numbers], np.int64)
-        return LabelTable(entries, _of_faces(of_vertex, mesh.triangles))
-
-    return objects
-
-
-def _groups(path: Path) -> tuple[dict[int, ObjectName], dict[int, int]]:
-    """Name and class of each object, and the object of each segment: of several, the smallest."""
-    document: Any = read_json(path)
-    rows: Any = document.get("segGroups") if isinstance(document, dict) else None
-    sound = isinstance(rows, list) and all(
-        isinstance(row, dict)
-        and type(row.get("objectId", row.get("id"))) is int
-        and isinstance(row.get("segments"), list)
-        for row in rows
-    )
-    if not sound:
-        raise InputRefused(
-            f"{path}: no segGroups with objectId and segments each. Download it again. "
-            "[objects.format]"
-        )
-    entries, object_of_segment = {}, {}
-    for row in sorted(rows, key=lambda row: -len(row["segments"])):
-        number, label = row.get("objectId", row.get("id")), str(row.get("label") or "")
-        entries[number] = ObjectName(f"{label or 'object'}_{number}", label)
-        object_of_segment.update(dict.fromkeys(row["segments"], number))
-    return entries, object_of_segment
-
-
-def _of_faces(of_vertex: Long, triangles: Int) -> Long:
-    """(F,) what two of a triangle's corners are, else its first."""
-    first, second, third = of_vertex[triangles].T
-    return np.asarray(np.where(second == third, second, first), np.int64)

@@ -208,13 +208,16 @@ def _captured(
             f"{source.name}: states a rolling_shutter, which is not undone: what a camera took "
             "while it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
         )
-    records = [r for frame in frames if (r := _record(capture, frame, findings))]
+    numbered = enumerate(frames)
+    records = [r for i, frame in numbered if (r := _record(capture, frame, i, findings))]
     capture.pictured.warn_of_others(findings, source)
     return capture, records
 
 
-def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> FrameRecord | None:
-    """One frame, or None where its pose or its file is missing."""
+def _record(
+    capture: _Capture, frame: Mapping[str, Any], number: int, findings: Findings
+) -> FrameRecord | None:
+    """One frame, the ``number``-th from 0 on, or None where its pose or its file is missing."""
     if "brackets" in frame:
         raise capture.refuse(
             "its frames are brackets of photographs. Make one frame of radiance of each with "
@@ -228,8 +231,9 @@ def _record(capture: _Capture, frame: Mapping[str, Any], findings: Findings) -> 
             "develop-video`, and convert what that writes.",
             "capture.video",
         )
-    if not isinstance(name, str):
-        findings.drop("(unnamed)", "it has no file_path", "capture.file")
+    if not isinstance(name, str) or not name.strip():
+        said = "its file_path is empty" if isinstance(name, str) else "it has no file_path"
+        findings.drop(f"frames[{number}]", said, "capture.file")
         return None
     width, height = capture.pixels(frame, "w"), capture.pixels(frame, "h")
     stated = width is not None and height is not None
