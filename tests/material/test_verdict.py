@@ -126,6 +126,18 @@ def test_the_median_of_psi_leaves_room_for_there_being_no_lobe():
     assert found.psi_median < psi[np.searchsorted(np.cumsum(density) / density.sum(), 0.5)] - 0.01
 
 
+def test_a_cost_that_noise_of_the_rays_makes_negative_is_no_more_than_all_explained():
+    phis = np.linspace(0, 1, 11)
+    terms = np.tile([100.0, 150.0, 200.0], (11, 1))
+    terms[3, 0] = 90.0  # cost(psi) = 90 - 300 psi + 200 psi^2 < 0 from psi = 0.42 on
+    found = lobe_from_costs(phis, terms, without=100.0, noisy=50.0, freedom=100, blur=0.01)
+    assert found.cost < 0
+    assert found.evidence == 1
+    verdict = verdict_on_views(found, True)
+    assert verdict.status == "prior"  # what is nothing but noise is no measurement
+    assert np.isfinite([verdict.phi_error, verdict.psi_error]).all()
+
+
 def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
     # Some of phi may be the footprint's, or all of it.
     for unresolved, confidence in ((0.03, "high"), (0.15, "low")):
