@@ -59,6 +59,18 @@ def test_a_glossy_surface_somewhat_over_one_is_no_emitter(world: World, lit: np.
     assert _find(world, lit).is_lamp[2]
 
 
+def test_what_exceeds_light_that_is_known_badly_is_no_emitter(world: World, lit: np.ndarray):
+    lit[world.texels.object_index() == 2] = 1.5 * SHADING / np.pi
+    shading, everywhere = np.full_like(lit, SHADING), np.ones(len(lit), bool)
+
+    def found(doubt: float):
+        return find_emitters(world.texels, lit, shading, everywhere, ~everywhere, doubt=doubt)
+
+    np.testing.assert_array_equal(found(0.3).is_lamp, [False] * 6 + [True])
+    assert not found(0.3).emissive[world.texels.object_index() == 2].any()
+    assert found(0.05).is_lamp[2]
+
+
 def test_single_noisy_texels_are_no_lamps(world: World, lit: np.ndarray):
     wall = np.flatnonzero(world.texels.object_index() == 0)
     # Isolated in the atlas: every fourth texel of every fourth row.

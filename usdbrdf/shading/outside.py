@@ -112,6 +112,12 @@ class Outside:
         """More than what a file tells or frames show."""
         return not (math.isnan(self.sky_error) and math.isnan(self.sun_error))
 
+    @property
+    def doubt(self) -> float:
+        """Relative standard error of the light that is inferred, at most 1; 0 where none is."""
+        errors = (self.sky_error, self.sun_error)
+        return min(max((e for e in errors if not math.isnan(e)), default=0.0), 1.0)
+
     def arrays(self) -> dict[str, Array]:
         """All of it."""
         image, z_up, sun = self.environment.image, self.environment.z_up, self.environment.sun

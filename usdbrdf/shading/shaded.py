@@ -61,6 +61,7 @@ def find_emitters(
     unknown_lamp: float = 0.0,
     unseen_lamps: Int | None = None,
     said: Mapping[int, bool] = MappingProxyType({}),
+    doubt: float = 0.0,
 ) -> Emitters:
     """Emissive texels from L_d and S (T, 3), grouped per object.
 
@@ -71,9 +72,11 @@ def find_emitters(
     unseen_lamps: numbers of the objects that shine though no frame shows them; of these
     ``lower_bound`` is True
     said: of objects whether they shine as a whole or not at all, whatever they show
+    doubt: relative standard error of S, of which what shines must be clear: what stands in a sun
+    that is known badly is no lamp
     """
     light = radiance.mean(axis=1)
-    shines = np.pi * light > EMITTER_RATIO * irradiance.mean(axis=1)
+    shines = np.pi * light > _clear_of(doubt) * irradiance.mean(axis=1)
     # A texel that no light reaches is dark, not a lamp: it must also beat the scene's median.
     shines &= light > np.median(light)
     shines &= clipped | (radiance.max(axis=1) >= unknown_lamp)
@@ -107,6 +110,11 @@ def find_emitters(
         if weight.sum() > 0:
             mean[i] = (radiance[own] * weight[:, None]).sum(axis=0) / weight.sum()
     return Emitters(emissive=emissive, is_lamp=is_lamp, radiance=mean, lower_bound=lower_bound)
+
+
+def _clear_of(doubt: float) -> float:
+    """pi L_d / S above which a texel shines."""
+    return EMITTER_RATIO * (1 + 2 * doubt)
 
 
 def _connected(texels: Texels, index: int, shines: Bool) -> Bool:
@@ -385,9 +393,10 @@ def shade_surface(
     irradiance = denoised_irradiance(surface.texels, traced.mean) if filtered else traced.mean
     texels, seen = surface.texels, coverage.measured
     may_shine = light.may_shine(coverage.clipped)
-    dimmest = light.least_of_lamps(EMITTER_RATIO / np.pi * irradiance.max(axis=1))
+    doubt = outside.doubt if outside else 0.0
+    dimmest = light.least_of_lamps(_clear_of(doubt) / np.pi * irradiance.max(axis=1))
     emitters = find_emitters(
-        texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said
+        texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt
     )
     albedo, over = albedo_map(texels, light.lit, irradiance, seen, emitters.emissive)
     level = np.maximum(traced.mean.mean(axis=1), 1e-30)
