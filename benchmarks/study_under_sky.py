@@ -75,6 +75,8 @@ def main() -> int:
     outwards = [sees_sky(rays, pose, lens) for pose in poses]
     if options.inside:
         poses = [pose for pose, outward in zip(poses, outwards, strict=True) if not outward]
+    if not poses:
+        parser.error(f"--inside: every frame of {options.capture} sees the sky.")
     poses = spread(poses, options.frames)
     sky *= brightness(objects, sky, poses, lens)
     scene = mitsuba_scene(objects, sky)

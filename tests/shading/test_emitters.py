@@ -69,6 +69,8 @@ def test_what_exceeds_light_that_is_known_badly_is_no_emitter(world: World, lit:
     np.testing.assert_array_equal(found(0.3).is_lamp, [False] * 6 + [True])
     assert not found(0.3).emissive[world.texels.object_index() == 2].any()
     assert found(0.05).is_lamp[2]
+    lit[world.texels.object_index() == 2] = 2.6 * SHADING / np.pi
+    assert found(np.inf).is_lamp[2]
 
 
 def test_single_noisy_texels_are_no_lamps(world: World, lit: np.ndarray):

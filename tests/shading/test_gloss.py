@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from tests.physics.surfaces import box, quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.shading import gloss
-from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
+from usdbrdf.shading.gloss import gloss_of_objects, mirrored_irradiance, mirrored_to_frames
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
 from usdbrdf.transport.directional_albedo import fitted_albedo, view_cosines
 from usdbrdf.transport.environment import black_environment
@@ -81,3 +83,54 @@ def test_a_wall_hides_what_it_hides():
     assert not found[middle < 0.2].any()
     # Beside it the floor mirrors its sides.
     assert (found[(middle > 0.3) & (middle < 0.5)] > 0).mean() > 0.5
+
+
+@pytest.fixture(scope="module")
+def lamplit(furnace):
+    """The same box with a lamp in its ceiling, and twelve frames from within it."""
+    surface, light = furnace
+    position = surface.texels.position
+    lamp = (position[:, 2] > 3.9) & (np.abs(position[:, :2] - [1.5, 2.5]).max(axis=1) < 0.5)
+    shown = np.where(lamp[:, None], 30 * light, light).astype(np.float32)
+    turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    eyes = [np.array([2 + 1.4 * np.cos(t), 2 + 1.4 * np.sin(t), 2.0]) for t in turns]
+    return surface, shown, frames_at([look_at(eye, np.array([2.0, 2.0, 0.0])) for eye in eyes])
+
+
+def _photographs(surface: TexturedScene, light: np.ndarray):
+    """What frames show of surfaces that are dull."""
+    texture = surface.texture(light)
+
+    def read(frames, i: int):
+        camera = frames.camera(i)
+        hits = surface.rays.closest(*camera.rays(camera.pixels()))
+        shape = tuple(int(n) for n in frames.resolution[i][::-1])
+        none = np.zeros(shape, np.bool_)
+        radiance = texture.at(hits.face, hits.u, hits.v).reshape(*shape, 3)
+        return SimpleNamespace(radiance=radiance, valid=~none, clipped=none, dark=none)
+
+    return read
+
+
+def test_objects_are_as_glossy_as_their_views_tell(lamplit, monkeypatch):
+    surface, light, frames = lamplit
+    monkeypatch.setattr(gloss, "read_frame", _photographs(surface, light))
+    index = np.arange(len(light), dtype=np.int64)
+    owner = surface.texels.object_index()
+    asked = surface, light, black_environment(), frames, index, 0
+    dull = gloss_of_objects(*asked)
+    assert (dull[[0, 2, 3, 4, 5]] < 0.1).all()
+    # The floor mirrors as a usual dielectric does, one wall twice as much.
+    true = np.array([1.0, 0, 0, 2.0, 0, 0])
+    shown = gloss._seen_by
+
+    def glossy(*given):
+        mirrored = gloss._mirrored_to(*asked[:5], given[-1], 77)
+        return shown(*given) + true[owner, None].astype(np.float32) * mirrored
+
+    monkeypatch.setattr(gloss, "_seen_by", glossy)
+    found = gloss_of_objects(*asked)
+    np.testing.assert_allclose(found[[0, 2, 3, 4, 5]], true[[0, 2, 3, 4, 5]], atol=0.2)
+    # Next to what all mirror, what few frames show is of no account.
+    few = gloss_of_objects(*asked[:3], frames_at(list(frames.world_from_camera[:2])), *asked[4:])
+    np.testing.assert_array_equal(few, 0)

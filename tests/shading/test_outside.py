@@ -196,7 +196,7 @@ def test_what_is_found_is_kept_as_it_is():
     assert not Outside.given(Environment(SKY, True).under(NO_SUN)).environment.sun.shines
     # Of what is inferred the worse is doubted, and no more than all of it.
     assert (given.doubt, replace(given, sky_error=0.2).doubt) == (0, 0.2)
-    assert replace(given, sky_error=0.2, sun_error=np.inf).doubt == 1
+    assert replace(given, sky_error=0.2, sun_error=0.4).doubt == 0.4
 
 
 def test_a_lone_object_in_the_open_gets_light_that_lets_nothing_reflect_too_much():

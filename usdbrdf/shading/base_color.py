@@ -18,6 +18,12 @@ EMITTER_RATIO = calibration.number("emitters.ratio")
 _DARK = calibration.number("albedo.dark")
 _OF_LIGHTING = calibration.number("albedo.error_of_lighting")
 _TINY = float(np.finfo(np.float32).tiny)
+_MOST_RATIO = calibration.number("emitters.most_ratio")
+
+
+def clear_of(doubt: float) -> float:
+    """pi L_d / S above which a texel shines, where S has the relative standard error ``doubt``."""
+    return min(EMITTER_RATIO * (1 + 2 * doubt), _MOST_RATIO)
 
 
 def albedo_from_irradiance(

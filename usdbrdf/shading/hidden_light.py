@@ -25,7 +25,7 @@ from usdbrdf.model.arrays import Array, Bool, Float, Long
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import Sampling
 from usdbrdf.shading.asked import Shining, irradiance_of_texels
-from usdbrdf.shading.base_color import EMITTER_RATIO, NEUTRAL, albedo_where_lit
+from usdbrdf.shading.base_color import NEUTRAL, albedo_where_lit, clear_of
 from usdbrdf.texturing.inpaint import inpaint
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -45,11 +45,12 @@ _RIM, _LEAK = 3, 2.0
 class KnownLamps(NamedTuple):
     """What shines for certain, ``texel`` (T,), keeps its radiance; so do objects more than a part
     ``most`` of whose seen texels send out more than they can reflect, but for those of ``said``,
-    by number, whose lamps a person knows."""
+    by number, whose lamps a person knows. doubt: relative standard error of what is received."""
 
     texel: Bool
     said: Mapping[int, bool]
     most: float = 0.5
+    doubt: float = 0.0
 
     @classmethod
     def unknown(cls, count: int) -> KnownLamps:
@@ -125,7 +126,7 @@ def _albedo(
     # Where lamps are not known yet, what they shine on seems to reflect more than it receives.
     usual = float(np.median(ratio[known])) if known.any() else NEUTRAL
     ratio /= max(1.0, usual)
-    shines = known & (ratio.mean(axis=1) > EMITTER_RATIO)
+    shines = known & (ratio.mean(axis=1) > clear_of(lamps.doubt))
     num_known, num_shining = (np.bincount(owner[seen], kind, count) for kind in (known, shines))
     lamp = num_shining > lamps.most * num_known
     for number, is_lamp in lamps.said.items():

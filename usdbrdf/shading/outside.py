@@ -9,7 +9,7 @@ of the sun's direction (``sun_direction``), then of its irradiance and the patch
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,16 +29,9 @@ from usdbrdf.shading.asked import (
     irradiance_of_texels,
     looked_around,
 )
-from usdbrdf.shading.gloss import mirrored_to_frames
+from usdbrdf.shading.gloss import Mirrored, mirroring
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
-from usdbrdf.shading.outside_light import (
-    Asked,
-    Sources,
-    gloss_of_scene,
-    jackknife,
-    levelled,
-    solved,
-)
+from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
 from usdbrdf.transport.environment import (
@@ -56,8 +49,8 @@ _FIRST_RAYS, _RAYS = 32, 1024
 # To be chosen from, and texels to the side of one that see, up to this difference of their cosine
 # to it, as much of the sun.
 _MANY_PER_SEGMENT, _AROUND, _AS_SUNLIT = 960, 2, 0.05
-# What surfaces mirror is of the light that was found before.
-_LOOKS_AT_MIRRORED = 2
+# What surfaces mirror follows from the light that was found before; then it is as it was told.
+_LOOKS_AT_MIRRORED, _AS_TOLD = 2, (1.0, 0.0)
 # Where more of the sunlit texels are clear of shadows than this, all of them tell more.
 _MOSTLY_CLEAR = 0.5
 # Lower and upper elevation of a band of patches, degrees, and their number.
@@ -114,9 +107,9 @@ class Outside:
 
     @property
     def doubt(self) -> float:
-        """Relative standard error of the light that is inferred, at most 1; 0 where none is."""
+        """Relative standard error of the light that is inferred; 0 where none is."""
         errors = (self.sky_error, self.sun_error)
-        return min(max((e for e in errors if not math.isnan(e)), default=0.0), 1.0)
+        return max((error for error in errors if not math.isnan(error)), default=0.0)
 
     def arrays(self) -> dict[str, Array]:
         """All of it."""
@@ -155,20 +148,12 @@ def estimated_outside(
         # What hides in a room would shine like what stands in the sun beside it.
         lamps, known = KnownLamps.unknown(len(lit)), _of_measured(seen, z_up)
         light = light_of_hidden(surface, lit, coverage, known, seed, lamps)
-
-        def mirrored(outside: Environment, index: Long) -> Double:
-            return np.pi * mirrored_to_frames(surface, light, outside, frames, index, seed)
-
+        mirrored = mirroring(surface, light, frames, seed)
         found = light_from_outside(surface, light, coverage, seen, z_up, seed, mirrored)
         return found.arrays() if found else {"nothing": np.zeros(0)}
 
     arrays = run.checkpoint("outside", compute)
     return None if "nothing" in arrays else Outside.restored(arrays)
-
-
-# Of an environment and texels (N,): what these would mirror of it and of all surfaces to the frames
-# if they were usual dielectrics, pi times that, (N, 3) W/m^2.
-Mirrored = Callable[[Environment, Long], Double]
 
 
 def light_from_outside(
@@ -181,8 +166,8 @@ def light_from_outside(
     mirrored: Mirrored | None = None,
 ) -> Outside | None:
     """What lights the scan ``lit`` (T, 3), L_d, from outside; None where hardly a direction of its
-    light leaves it. seen: what the frames show of it; mirrored: None where ``lit`` holds nothing of
-    that."""
+    light leaves it. seen: what the frames show of it; mirrored: what surfaces mirror to these, None
+    where ``lit`` holds nothing of that."""
     asked = asked_texels(surface.texels, lit, coverage, seed)
     if asked is None:
         return None
@@ -222,11 +207,10 @@ def light_from_outside(
             break
         strengths: Double = np.exp(found.log_radiance)
         outside = Environment(_picture(seen, patches, used, strengths[:-1], z_up), z_up)
-        outside = outside.under(sun._replace(irradiance=strengths[-1]))
-        asked = asked._replace(mirrored=mirrored(outside, asked.texel))
-        own, sources = _with_sun(surface, asked, sky, sun, seed)
-        sources = gloss_of_scene(own, sources, np.zeros_like(sources.share))
-        sky, with_sun = sky._replace(gloss=sources.gloss), (own, sources)
+        in_sun = outside.under(sun._replace(irradiance=strengths[-1]))
+        asked = asked._replace(mirrored=mirrored(in_sun, asked.texel))
+        sky = sky._replace(gloss=_AS_TOLD)
+        with_sun = _with_sun(surface, asked, sky, sun, seed)
         found = solved(*with_sun)
     light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
     strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
@@ -241,7 +225,7 @@ def light_from_outside(
             share, _ = _shares(surface, clear, unseen, z_up, seed, _RAYS)
             clear = _under_what_was_seen(surface, lit, clear, seen, z_up, seed)
             if mirrored is not None:
-                clear = clear._replace(mirrored=mirrored(outside, clear.texel))
+                clear = clear._replace(mirrored=mirrored(in_sun, clear.texel))
             clearly = _with_sun(surface, clear, sky._replace(share=share[used]), sun, seed)
             told = solved(*clearly)
             own_error = jackknife(*clearly, told)
@@ -250,6 +234,8 @@ def light_from_outside(
         found = levelled(*with_sun, found)
         sun = sun._replace(irradiance=np.exp(found.log_radiance[-1]))
     else:
+        if mirrored is not None:
+            asked = asked._replace(mirrored=mirrored(outside, asked.texel))
         sun, found = NO_SUN, solved(asked, sky)
         found, error = levelled(asked, sky, found), jackknife(asked, sky, found)
     radiance_of_sky = np.exp(found.log_radiance[: len(used)])

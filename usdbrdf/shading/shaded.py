@@ -21,7 +21,7 @@ from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
-from usdbrdf.shading.base_color import EMITTER_RATIO, albedo_map
+from usdbrdf.shading.base_color import albedo_map, clear_of
 from usdbrdf.shading.clipped_light import ClippedLight, clipped_groups, estimate_clipped_light
 from usdbrdf.shading.hidden_light import KnownLamps, with_hidden_light
 from usdbrdf.shading.outside import Outside
@@ -76,7 +76,7 @@ def find_emitters(
     that is known badly is no lamp
     """
     light = radiance.mean(axis=1)
-    shines = np.pi * light > _clear_of(doubt) * irradiance.mean(axis=1)
+    shines = np.pi * light > clear_of(doubt) * irradiance.mean(axis=1)
     # A texel that no light reaches is dark, not a lamp: it must also beat the scene's median.
     shines &= light > np.median(light)
     shines &= clipped | (radiance.max(axis=1) >= unknown_lamp)
@@ -110,11 +110,6 @@ def find_emitters(
         if weight.sum() > 0:
             mean[i] = (radiance[own] * weight[:, None]).sum(axis=0) / weight.sum()
     return Emitters(emissive=emissive, is_lamp=is_lamp, radiance=mean, lower_bound=lower_bound)
-
-
-def _clear_of(doubt: float) -> float:
-    """pi L_d / S above which a texel shines."""
-    return EMITTER_RATIO * (1 + 2 * doubt)
 
 
 def _connected(texels: Texels, index: int, shines: Bool) -> Bool:
@@ -346,11 +341,11 @@ def _light(
 ) -> tuple[ClippedLight, UnseenLamps]:
     """L_d with what hidden surfaces send on, and with the lamps that no frame measures."""
     environment = outside.environment if outside else black_environment()
-    texels, filled = surface.texels, lit
+    texels, filled, doubt = surface.texels, lit, outside.doubt if outside else 0.0
     owner = texels.object_index()
     groups = clipped_groups(texels, lit, coverage, said)
     told = np.isin(owner, [number for number, is_lamp in said.items() if is_lamp])
-    known = KnownLamps(told | groups.texels_of(groups.lamp), said)
+    known = KnownLamps(told | groups.texels_of(groups.lamp), said, doubt=doubt)
     lit = with_hidden_light(run, "hidden", surface, lit, coverage, environment, seed, known)
     # In the light of what it may be that no frame shows.
     unseen = estimate_unseen_lamps(run, surface, lit, coverage, frames, outside, seed, said)
@@ -360,7 +355,7 @@ def _light(
     if (light.lit[lamps] == filled[lamps]).all() and not (known.texel & ~told & ~lamps).any():
         return light, unseen
     # Hidden surfaces send on the light of these as well, and none of what is no lamp after all.
-    known = KnownLamps(told | lamps, said)
+    known = KnownLamps(told | lamps, said, doubt=doubt)
     lamplit = np.where((coverage.observed | known.texel)[:, None], light.lit, filled)
     given = lamplit, coverage, environment, seed, known, light.lit
     return replace(light, lit=with_hidden_light(run, "hidden-lit", surface, *given)), unseen
@@ -394,7 +389,7 @@ def shade_surface(
     texels, seen = surface.texels, coverage.measured
     may_shine = light.may_shine(coverage.clipped)
     doubt = outside.doubt if outside else 0.0
-    dimmest = light.least_of_lamps(_clear_of(doubt) / np.pi * irradiance.max(axis=1))
+    dimmest = light.least_of_lamps(clear_of(doubt) / np.pi * irradiance.max(axis=1))
     emitters = find_emitters(
         texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt
     )
