@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ import trimesh
 
 from tests.scenes import room_mesh, write_ply
 from usdbrdf.errors import InputRefused
+from usdbrdf.model.mesh import triangulate
+from usdbrdf.model.polygons import ears
 from usdbrdf.untrusted import bounds
 from usdbrdf.untrusted.mesh_files import FileMesh, checked_mesh, mesh_from_file, model_from_file
 
@@ -157,6 +160,27 @@ def test_polygons_of_any_shape_are_covered_once(tmp_path, corners, area, turned)
             assert abs(seen.sum()) == pytest.approx(area)
         if path.suffix == ".ply":
             assert mesh.face_label.tolist() == [7] + [8] * (len(corners) - 2)
+
+
+def test_polygons_that_cross_themselves_and_many_quads_take_no_time():
+    rng = np.random.default_rng(0)
+    tangle = np.pad(rng.random((1600, 2)), ((0, 0), (0, 1)))
+    darts = np.tile([(*corner, 0) for corner in _DART], (20_000, 1))
+    start = time.process_time()
+    triangles = ears(tangle)
+    cut = triangulate(np.full(20_000, 4), np.arange(80_000), points=darts)
+    assert time.process_time() - start < 10
+    assert triangles.shape == (1598, 3)
+    assert np.unique(triangles).size == 1600
+    assert cut.corners[-2:].tolist() == [[79_997, 79_998, 79_999], [79_997, 79_999, 79_996]]
+
+
+def test_polygons_of_very_many_corners_are_fans():
+    turns = np.linspace(0, 2 * np.pi, 2100, endpoint=False)
+    across = np.where(np.arange(2100) % 2, 1, 0.5)
+    star = np.stack([across * np.cos(turns), across * np.sin(turns), 0 * turns], axis=1)
+    cut = triangulate(np.array([2100]), np.arange(2100), points=star)
+    assert (cut.corners[:, 0] == 0).all()
 
 
 def test_objects_of_an_obj_may_have_faces_of_other_sizes(tmp_path):
