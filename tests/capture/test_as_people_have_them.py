@@ -55,6 +55,15 @@ def _write_bytes(path: Path, pixels: np.ndarray, **attributes: int) -> None:
     assert output.close()
 
 
+def _write_named(path: Path, pixels: np.ndarray, names: list[str]) -> None:
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], len(names), "float")
+    spec.channelnames = names
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    output.write_image(np.ascontiguousarray(pixels[..., : len(names)]))
+    output.close()
+
+
 def _as_photographs(made: MadeCapture, suffix: str, **attributes: int) -> None:
     with edited(made.manifest) as document:
         for i, frame in enumerate(document["frames"]):
@@ -238,6 +247,22 @@ def test_depths_beside_a_picture_are_not_what_is_meant(made, depths):
     assert {path.suffix for path in pictures.numbered().values()} == {".jpg"}
     photograph = made.folder / "photographs/0004.jpg"
     assert pictures.named("0004.HEIC") == pictures.named("0004") == photograph
+
+
+@pytest.mark.parametrize("layers", [("normal",), ("A", "N"), ("camera",)])
+def test_a_picture_of_layers_is_not_meant_where_one_of_colours_is(tmp_path, layers):
+    pixels = np.ones((3, 4, 3 * len(layers)), np.float32)
+    for folder, of in (("rgb", [""]), ("aov", [f"{layer}." for layer in layers])):
+        (tmp_path / folder).mkdir()
+        _write_named(tmp_path / folder / "0.exr", pixels, [f"{n}{c}" for n in of for c in "RGB"])
+    pictures = pictures_of(tmp_path, IngestOptions(frames=tmp_path))
+    assert pictures.named("0") == pictures.numbered()[0] == (tmp_path / "rgb/0.exr").resolve()
+    to_display = np.zeros((3, 4, 3), np.uint8)
+    _write_bytes(tmp_path / "rgb/0.jpg", to_display)
+    (tmp_path / "rgb/0.exr").unlink()
+    pictures = pictures_of(tmp_path, IngestOptions(frames=tmp_path))
+    found = "aov/0.exr" if layers == ("camera",) else "rgb/0.jpg"
+    assert pictures.named("0") == (tmp_path / found).resolve()
 
 
 def test_a_missing_frame_is_not_replaced_by_a_picture_of_another_kind(made):

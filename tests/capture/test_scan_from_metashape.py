@@ -167,6 +167,21 @@ def test_cameras_of_one_label_are_told_apart_by_their_groups_or_left_out(project
     assert_same(scan, room, poses=room.world_from_camera[order], names=room.names)
 
 
+def test_a_camera_of_one_label_with_another_is_left_out_although_that_is_not_aligned(project, room):
+    document = ET.parse(project / "cameras.xml").getroot()
+    for camera in document.iter("camera"):
+        if camera.get("id") in ("6", "7"):
+            camera.set("label", "DSC0006.JPG")
+        if camera.get("id") == "6":
+            camera.remove(camera.find("transform"))
+    ET.ElementTree(document).write(project / "cameras.xml")
+    (project / "images" / "DSC0007.jpg").unlink()
+    scan = read_scan(project, OPTIONS)
+    assert len(scan.frames) == 8
+    assert "DSC0006.jpg" not in {path.name for path in scan.frames.image_paths}
+    assert any("2 cameras have this label and one picture" in said for said in scan.warnings)
+
+
 def test_of_a_rig_only_the_master_has_a_transform(tmp_path, room):
     """Two cameras on one rig, at five places; the transform is the component's."""
     document, sensors, cameras = _chunk(component=True)

@@ -89,6 +89,17 @@ def test_frames_may_be_thinned_out_and_lost_cameras_are_left_out(scene, room):
     assert [s for s in scan.warnings if "'4.jpg': its camera was lost" in s]
 
 
+def test_numbers_of_objects_below_0_are_no_objects(scene, room):
+    path = scene / "scene0000_00.aggregation.json"
+    groups = json.loads(path.read_text())
+    groups["segGroups"][0] |= {"id": -1, "objectId": -1}
+    path.write_text(json.dumps(groups))
+    scan = read_scan(scene, OPTIONS)
+    names = {each.label for each in scan.objects}
+    assert {f"{name}_{i}" for i, name in enumerate(room.names) if i} <= names
+    assert f"{room.names[0]}_-1" not in names
+
+
 def test_another_mesh_has_its_own_objects(scene, room, tmp_path):
     write_ply(tmp_path / "other.ply", room.points[::-1], len(room.points) - 1 - room.triangles)
     scan = read_scan(scene, IngestOptions(assume_srgb=True, mesh=tmp_path / "other.ply"))

@@ -10,6 +10,7 @@ import pytest
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files import documents
 from usdbrdf.files.documents import read_json, write_json
+from usdbrdf.files.tables import csv_rows
 
 
 @pytest.fixture
@@ -63,6 +64,27 @@ def test_line_of_malformed(read):
 def test_not_utf8(read):
     with pytest.raises(InputRefused, match=r"byte 2 is not UTF-8.+\[document\.json\]$"):
         read(b'["\xff"]')
+
+
+@pytest.mark.parametrize("damaged", ["[1]".encode("utf-16")[:-1], b"\xff\xfe[\x00\x00\xd8"])
+def test_damaged_utf16_is_called_so(read, damaged):
+    with pytest.raises(InputRefused, match=r"is not UTF-16, as its mark says\. Save.+json\]$"):
+        read(damaged)
+
+
+@pytest.mark.parametrize("row", ['"a.jpg,1,2', 'a.jpg,"1,2\nb.jpg,3,4'])
+def test_a_quote_that_nobody_closes_is_refused(tmp_path, row):
+    (tmp_path / "a.csv").write_text(f"name,x,y\n0.jpg,0,0\n{row}\n")
+    said = r"a\.csv: .*quote.* '" + row[:4] + r".*\[document\.table\]$"
+    with pytest.raises(InputRefused, match=said):
+        csv_rows(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text('name,x,y\n"a ""b"", c",1,"2"\n')
+    assert csv_rows(tmp_path / "a.csv") == ({"name": 'a "b", c', "x": "1", "y": "2"},)
+
+
+def test_a_name_is_no_number_with_a_decimal_comma(tmp_path):
+    (tmp_path / "a.csv").write_text("#name;x\n1,5;2,5\n")
+    assert csv_rows(tmp_path / "a.csv") == ({"name": "1,5", "x": "2.5"},)
 
 
 @pytest.mark.fault("C13")

@@ -279,6 +279,20 @@ def test_layers_of_which_none_is_the_whole_picture_are_listed(tmp_path, names):
 
 
 @pytest.mark.fault("I8")
+@pytest.mark.parametrize(
+    "layer",
+    ["normal", "N", "albedo", "Position", "uv", "ViewLayer.Denoising Normal", "crypto_object00"],
+)
+def test_an_only_layer_that_is_no_picture_is_refused(tmp_path, layer):
+    write_with_oiio(tmp_path / "a.exr", np.ones((3, 4, 3), np.float32), _layer(layer, "RGB"))
+    said = rf"1 layer has R, G and B \({layer!r}\), .* Export .*channels\]$"
+    with pytest.raises(ImageRefused, match=said):
+        read_radiance(tmp_path / "a.exr")
+    write_with_oiio(tmp_path / "a.exr", np.ones((3, 4, 3), np.float32), _layer("camera1", "RGB"))
+    assert read_radiance(tmp_path / "a.exr").shape == (3, 4, 3)
+
+
+@pytest.mark.fault("I8")
 def test_layers_may_be_parts_of_the_file(tmp_path, radiance):
     path, names = tmp_path / "a.exr", (_layer("diffuse", "RGB"), _layer("beauty", "RGB"))
     _two_parts(path, radiance + 1, radiance, names)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ import trimesh
 
 from tests.scenes import room_mesh, write_ply
 from usdbrdf.errors import InputRefused
+from usdbrdf.model.mesh import triangulate
+from usdbrdf.model.polygons import ears
 from usdbrdf.untrusted import bounds
 from usdbrdf.untrusted.mesh_files import FileMesh, checked_mesh, mesh_from_file, model_from_file
 
@@ -159,6 +162,27 @@ def test_polygons_of_any_shape_are_covered_once(tmp_path, corners, area, turned)
             assert mesh.face_label.tolist() == [7] + [8] * (len(corners) - 2)
 
 
+def test_polygons_that_cross_themselves_and_many_quads_take_no_time():
+    rng = np.random.default_rng(0)
+    tangle = np.pad(rng.random((1600, 2)), ((0, 0), (0, 1)))
+    darts = np.tile([(*corner, 0) for corner in _DART], (20_000, 1))
+    start = time.process_time()
+    triangles = ears(tangle)
+    cut = triangulate(np.full(20_000, 4), np.arange(80_000), points=darts)
+    assert time.process_time() - start < 10
+    assert triangles.shape == (1598, 3)
+    assert np.unique(triangles).size == 1600
+    assert cut.corners[-2:].tolist() == [[79_997, 79_998, 79_999], [79_997, 79_999, 79_996]]
+
+
+def test_polygons_of_very_many_corners_are_fans():
+    turns = np.linspace(0, 2 * np.pi, 2100, endpoint=False)
+    across = np.where(np.arange(2100) % 2, 1, 0.5)
+    star = np.stack([across * np.cos(turns), across * np.sin(turns), 0 * turns], axis=1)
+    cut = triangulate(np.array([2100]), np.arange(2100), points=star)
+    assert (cut.corners[:, 0] == 0).all()
+
+
 def test_objects_of_an_obj_may_have_faces_of_other_sizes(tmp_path):
     """trimesh has those of each object as they are, where they all have as many corners."""
     path = tmp_path / "mesh.obj"
@@ -186,6 +210,14 @@ def test_objects_of_an_obj_may_have_faces_of_other_sizes(tmp_path):
         lambda text: text.replace("\n", "\r").encode(),
         lambda text: text.replace("\n", " \r\n").replace(" \r", "\r", 1).encode(),
         lambda text: text.replace("\n0 1 2", "\n\n  0\t1\n2").encode(),
+        lambda text: text.replace("of mine", "before the end_header\ncomment b").encode(),
+        lambda text: text.replace("format ascii", "format\tascii").encode(),
+        lambda text: text.replace("list uchar", "list float").encode(),
+        lambda text: text.replace(" 0\n", " 0 7 7\n").replace("0 1 2\n1", "0 1 2 7 7\n1").encode(),
+        lambda text: text.replace("3 0 1 2\n", "3 0 1 2 9\n").encode(),
+        lambda text: (
+            text.replace("indices\n", "indices\nproperty int n\nproperty int corners\n") + "8 9\n"
+        ).encode(),
     ],
 )
 def test_text_of_ply_may_be_written_in_other_ways(tmp_path, written):
@@ -214,6 +246,29 @@ def test_binary_ply_whose_header_has_lines_of_cr_alone(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("kind", "row", "words"),
+    [
+        ("float", "3 0 1 1.5 0", "a face has the vertex 1.5"),
+        ("int", "3 0 1 2 nan", "object_id nan, no object's number"),
+        ("int", "3 0 1 2 1.5", "object_id 1.5, no object's number"),
+        ("int", "3 0 1 2 7", ""),
+    ],
+)
+def test_numbers_of_vertices_and_objects_are_whole(tmp_path, kind, row, words):
+    path = tmp_path / "mesh.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face 1\nproperty list float {kind} vertex_indices\n"
+        f"property float object_id\nend_header\n0 0 0\n1 0 0\n1 1 0\n{row}\n"
+    )
+    if words:
+        with pytest.raises(InputRefused, match=rf"mesh\.ply: .*{words}.*\[mesh\.read\]$"):
+            mesh_from_file(path)
+    else:
+        assert mesh_from_file(path).face_label.tolist() == [7]
+
+
+@pytest.mark.parametrize(
     ("change", "words"),
     [
         (("property float y", "property vec y"), "numbers of an unknown kind, 'vec'"),
@@ -223,6 +278,11 @@ def test_binary_ply_whose_header_has_lines_of_cr_alone(tmp_path):
         (("end_header", "header ends"), "no end of its header"),
         (("ascii", "packed"), "its format is 'packed'"),
         (("element vertex", "element vertex of"), "its header has the line"),
+        (("element face", "element vertex 0\nelement face"), "more than one element 'vertex'"),
+        (("list uchar int", "int"), "its faces have no list vertex_indices"),
+        (("3 0 1 2", "inf 0 1 2"), "a list has inf elements"),
+        (("3 0 1 2", "2.5 0 1 2"), "a list has 2.5 elements"),
+        (("1 1 0\n", "1 1 0 5\n"), "it ends within a face"),
     ],
 )
 def test_ply_that_says_no_mesh_is_refused_in_our_words(tmp_path, change, words):

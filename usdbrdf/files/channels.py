@@ -6,12 +6,22 @@ parts of it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 _MAX_PARTS = 64  # of one file, which are searched
 # What renderers call the pass that shows what a camera would.
 _BEAUTY = frozenset(("beauty", "combined", "rgba"))
+# And what those are called that show something else: parts of names, and whole ones.
+_OTHERWISE = re.compile(
+    "albedo|ambientocc|basecolou?r|bump|crypto|curvature|denoising|depth|diff|emission|emit|fresnel"
+    "|gloss|indirect|index(ob|ma)|motion|mask|metal|normal|objectid|materialid|occlusion|opacity"
+    "|position|reflection|refraction|rough|selfillum|shadow|sheen|specular|subsurface|tangent"
+    "|trans(col|dir|ind|mission|lucency)|vector|velocity|worldpos"
+    "|^(ao|coat|direct|env|flow|gi|height|ids?|lighting|matte|mist|mv|n|ng|nn|p|pn|pos|pref|spec|sss|"
+    "st|uvw?s?|volume(dir|ind|direct|indirect)?|z)$"
+)
 _LETTERS = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
 
 
@@ -29,8 +39,9 @@ def colours_of(source: Any) -> dict[str, int] | list[str]:
     """The channels of the layer that is shown in an OpenImageIO reader's image, which then is at
     the part with it; else the layers of which each might be.
 
-    R, G and B come first; then the only layer with such, or the only one that is called as
-    renderers call their whole picture. RuntimeError where the parts cannot be read.
+    R, G and B come first; then the only layer that is called as renderers call their whole picture,
+    or the only one, unless it is called as something that is none. RuntimeError where the parts
+    cannot be read.
     """
     found: list[tuple[int, str, dict[str, int]]] = []
     part = 0
@@ -44,9 +55,15 @@ def colours_of(source: Any) -> dict[str, int] | list[str]:
             return layers[""]
         found += [(part, layer, channels) for layer, channels in layers.items()]
     beauty = [one for one in found if one[1].lower().rpartition(".")[2] in _BEAUTY]
-    chosen = next((some[0] for some in (found, beauty) if len(some) == 1), None)
+    alone = [] if any(_shows_otherwise(layer) for _, layer, _ in found) else found
+    chosen = next((some[0] for some in (beauty, alone) if len(some) == 1), None)
     if part:
         source.geterror()  # that there is no such part
         if not source.seek_subimage(chosen[0] if chosen else 0, 0):
             raise RuntimeError
     return chosen[2] if chosen else [layer for _, layer, _ in found]
+
+
+def _shows_otherwise(layer: str) -> bool:
+    """Whether a layer is called as a pass that is no picture, as normals or an object's numbers."""
+    return bool(_OTHERWISE.search(re.sub(r"[\W\d_]", "", layer.lower().rpartition(".")[2])))

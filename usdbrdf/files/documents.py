@@ -125,8 +125,10 @@ def read_text(path: Path) -> str:
             f"{path}: cannot be read ({error.strerror}). Check its permissions. [document.missing]"
         ) from error
     except UnicodeDecodeError as error:
+        encoding = "UTF-16, as its mark says" if error.encoding.startswith("utf-16") else "UTF-8"
         raise InputRefused(
-            f"{path}: byte {error.start} is not UTF-8. Save the document as UTF-8. [document.json]"
+            f"{path}: byte {error.start} is not {encoding}. Save the document as UTF-8. "
+            "[document.json]"
         ) from error
 
 

@@ -21,7 +21,7 @@ import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
-from usdbrdf.files.channels import colours_of
+from usdbrdf.files.channels import colours_of, layers_with_colours
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Bool, Byte, Float
 
@@ -78,8 +78,9 @@ def _radiance(path: Path, max_side: int, alpha: bool) -> Float:
         names = ", ".join(map(repr, colours or source.spec().channelnames))
         said = f"no channels R, G and B among {names}"
         if colours:
+            have = "layer has" if len(colours) == 1 else "layers have"
             said = (
-                f"{len(colours)} layers have R, G and B ({names}), and not one of them alone is "
+                f"{len(colours)} {have} R, G and B ({names}), and not one of them alone is "
                 "called beauty or Combined"
             )
         raise ImageRefused(f"{path}: {said}. Export the beauty pass as R, G, B. [image.channels]")
@@ -137,6 +138,15 @@ def image_size(path: Path) -> tuple[int, int, tuple[str, ...]]:
     """Width and height of the display window and the channel names, from the header alone."""
     spec = open_image(path).spec()
     return spec.full_width, spec.full_height, tuple(spec.channelnames)
+
+
+def kind_of_colours(path: Path) -> int:
+    """Which colours an image's header announces: 2, R, G and B; 1, those of a layer; 0, none, so
+    that ``read_radiance`` refuses it."""
+    source = open_image(path)
+    with _decoding(path, source, "not a readable image", "image.unreadable"):
+        known = isinstance(colours_of(source), dict)
+    return known + ("" in layers_with_colours(source.spec().channelnames))
 
 
 def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:

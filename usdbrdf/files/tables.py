@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 from xml.etree import ElementTree
@@ -90,11 +90,12 @@ def csv_rows(path: Path, names: Collection[str] = ()) -> tuple[dict[str, str], .
     header, table = found
     rows = []
     for row in table:
-        values = [_with_point(value.strip()) for value in row]
+        values = [value.strip() for value in row]
         if len(values) == len(header):
             if any(values):
-                rows.append(dict(zip(header, values, strict=True)))
-        elif not values[0].startswith("#") and any(map(_is_number, values)):
+                named = zip(header, values, strict=True)
+                rows.append({k: v if k in _NO_NUMBERS else _with_point(v) for k, v in named})
+        elif not values[0].startswith("#") and any(_is_number(_with_point(v)) for v in values):
             raise InputRefused(
                 f"{path}: the row {', '.join(row)[:60]!r} has {len(row)} values under "
                 f"{len(header)} names. Export it again. [document.table]"
@@ -110,11 +111,23 @@ def _table(
         by = separator or max(_SEPARATORS, key=line.count)
         header = [name.strip(" #").lower() for name in next(csv.reader([line], delimiter=by))]
         if by in line and set(names) <= set(header):
-            return header, [row for row in csv.reader(lines[i + 1 :], delimiter=by) if row]
+            return header, list(_rows(lines[i + 1 :], by))
     return None
 
 
+def _rows(lines: Sequence[str], separator: str) -> Iterator[list[str]]:
+    """csv.Error for a quote that nothing closes: all lines behind it would be part of one word."""
+    reader, begun = csv.reader([*lines, ""], delimiter=separator), 0
+    for row in reader:
+        if begun < len(lines) < reader.line_num:
+            raise csv.Error(f"nothing closes the quote in the row {lines[begun][:60]!r}")
+        begun = reader.line_num
+        if row:
+            yield row
+
+
 _SEPARATORS = ",;\t"
+_NO_NUMBERS = frozenset(("name",))  # columns of words, whatever they look like
 
 
 def _with_point(value: str) -> str:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
-from usdbrdf.model.polygons import ears, fans_that_leave
+from usdbrdf.model.polygons import OTHER_DIAGONAL, ears, fans_that_leave
 
 # What a person may ask about an object: of shading, of the fit; and what is then not fitted.
 LAMP, METAL, GLASS, REFIT = "lamp", "metal", "glass", "refit"
@@ -143,7 +143,11 @@ def triangulate(
     corners = np.stack([first, first + in_fan + 1, first + in_fan + 2], axis=-1)
     indices = np.asarray(indices, np.int32)
     if points is not None:
-        for i in fans_that_leave(points, indices[corners], polygon).tolist():
+        leaving = fans_that_leave(points, indices[corners], polygon)
+        quads = leaving[counts[leaving] == len(OTHER_DIAGONAL) + 2]
+        for k, triangle in enumerate(OTHER_DIAGONAL):
+            corners[np.searchsorted(polygon, quads) + k] = firsts[quads, None] + triangle
+        for i in np.setdiff1d(leaving, quads).tolist():
             own = indices[firsts[i] : firsts[i] + counts[i]]
             corners[slice(*np.searchsorted(polygon, (i, i + 1)))] = firsts[i] + ears(points[own])
     if left_handed:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from usdbrdf.model.arrays import Array, Bool, Double, Int, Long
@@ -9,6 +11,11 @@ from usdbrdf.model.arrays import Array, Bool, Double, Int, Long
 # Of a polygon's area: by how much a triangle of its fan may be wound the other way, as rounding and
 # quads that are not quite flat have it.
 _ROUNDING = 1e-9
+# Polygons of more corners keep their fan: to look for ears takes the square of their number, and of
+# each corner that is cut so many are looked at in the mean.
+_MOST_CORNERS, _MOST_LOOKS = 2_000, 16
+# A quad whose fan leaves it, as where the corner before or behind its first is not convex.
+OTHER_DIAGONAL = ((1, 2, 3), (1, 3, 0))
 
 
 def fans_that_leave(points: Array, corners: Int | Long, polygon: Int | Long) -> Long:
@@ -21,24 +28,34 @@ def fans_that_leave(points: Array, corners: Int | Long, polygon: Int | Long) -> 
     with np.errstate(invalid="ignore", over="ignore"):
         across = np.cross(second - first, third - first)
         whole = np.add.reduceat(across, starts)
-        of = np.repeat(whole, np.diff(starts, append=len(polygon)), axis=0)
+        sizes = np.diff(starts, append=len(polygon))
+        of = np.repeat(whole, sizes, axis=0)
         against = (across * of).sum(axis=1) < -_ROUNDING * (of**2).sum(axis=1)
+    against &= np.repeat(sizes, sizes) <= _MOST_CORNERS - 2
     return np.unique(polygon[against]).astype(np.int64)
 
 
 def ears(points: Array) -> Long:
-    """(N - 2, 3) corners of the triangles of one polygon (N, 3), each wound as it is: ears that are
-    cut off one by one. Of what crosses itself no corner is an ear; any is cut then.
+    """(N - 2, 3) corners of the triangles of one polygon (N, 3) whose fan leaves it, each wound as
+    it is: ears that are cut off one by one. What crosses itself has none in the end, and what is
+    left of it becomes a fan.
 
     All triangles have the polygon's own corners; those of no area may be among them.
     """
+    if len(points) == len(OTHER_DIAGONAL) + 2:
+        return np.array(OTHER_DIAGONAL, np.int64)
     plane = _flattened(np.asarray(points, np.float64))
     left, triangles, at = np.arange(len(plane)), [], 0
+    looks = _MOST_LOOKS * len(plane)
     while len(left) > 3:
-        at = _ear(plane[left], at % len(left))
+        found, looked = _ear(plane[left], at % len(left), looks)
+        if found is None:
+            break
+        at, looks = found, looks - looked
         triangles.append([left[at - 1], left[at], left[(at + 1) % len(left)]])
         left = np.delete(left, at)
-    return np.array([*triangles, left], np.int64)
+    triangles += [[left[0], *pair] for pair in pairwise(left[1:])]
+    return np.array(triangles, np.int64)
 
 
 def _flattened(points: Double) -> Double:
@@ -50,17 +67,19 @@ def _flattened(points: Double) -> Double:
     return np.asarray(points @ np.stack([across, np.cross(normal, across)], axis=1))
 
 
-def _ear(plane: Double, start: int) -> int:
-    """The first corner from ``start`` on whose triangle holds no other corner of the polygon."""
+def _ear(plane: Double, start: int, most: int) -> tuple[int | None, int]:
+    """The first corner from ``start`` on whose triangle holds no other corner of the polygon, of
+    the ``most`` next ones, or None; and how many were looked at."""
     before, after = np.roll(plane, 1, axis=0), np.roll(plane, -1, axis=0)
     turn = _turns(before, plane, after)
     # What lies in a triangle of convex corners has one that is not convex in it.
     reflex = plane[turn <= 0]
-    for at in np.roll(np.flatnonzero(turn > 0), -int((turn[:start] > 0).sum())).tolist():
+    convex = np.roll(np.flatnonzero(turn > 0), -int((turn[:start] > 0).sum()))[:most].tolist()
+    for i, at in enumerate(convex):
         triangle = before[at], plane[at], after[at]
         if not _inside(reflex, triangle).any():
-            return int(at)
-    return int(np.abs(turn).argmin())
+            return int(at), i + 1
+    return None, len(convex)
 
 
 def _inside(points: Double, triangle: tuple[Double, Double, Double]) -> Bool:

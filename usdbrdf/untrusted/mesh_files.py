@@ -191,6 +191,11 @@ def _refuse_if_many(path: Path, broken: Bool, what: str, rule: str) -> None:
 def _mesh_from_ply(file: BinaryIO) -> FileMesh:
     ply = ply_of(file.read())
     cut, label = ply.triangulation, ply.faces.get(LABEL_PROPERTY)
+    if label is not None and label.dtype.kind == "f":
+        with np.errstate(invalid="ignore", over="ignore"):
+            none = ~(np.abs(label) < 2**53) | (np.floor(label) != label)
+        if none.any():
+            raise ValueError(f"a face has {LABEL_PROPERTY} {label[none][0]:g}, no object's number")
     label = None if label is None else label.astype(np.int64)[cut.polygon]
     return _file_mesh(ply.points, cut.triangles, label)
 

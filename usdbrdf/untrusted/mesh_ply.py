@@ -25,6 +25,8 @@ _NAMES = {kind: name for name, kind in reversed(_KINDS.items())}
 _BEGINNING = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
 _LONGEST_HEADER = 1 << 16
 _CORNERS, _UV = ("vertex_indices", "vertex_index"), "texcoord"
+# Columns of a file's rows beside those that it names itself: no word of a header has blanks.
+_COUNT, _FACE, _UV_COUNT, _FACE_UV = "corners of each", "the corners", "uv of each", "the uv"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,19 +71,21 @@ class Ply:
         head += [f"comment TextureFile {self.texture}"] if self.texture else []
         head += [f"element vertex {len(self.points)}", *map(_property, self.vertices.items())]
         head += [f"element face {len(fans.triangles)}", "property list uchar int vertex_indices"]
-        face: dict[str, Array] = {name: a[fans.polygon] for name, a in self.faces.items()}
+        others = {name: a for name, a in self.faces.items() if name not in (*_CORNERS, _UV)}
+        face: dict[str, Array] = {name: a[fans.polygon] for name, a in others.items()}
         head += map(_property, face.items())
-        row: list[Any] = [("n", "u1"), ("corners", "<i4", 3)]
+        row: list[Any] = [(_COUNT, "u1"), (_FACE, "<i4", 3)]
         row += [(name, array.dtype.newbyteorder("<")) for name, array in face.items()]
         if self.corner_uv is not None:
             head.append(f"property list uchar float {_UV}")
-            row += [("n of uv", "u1"), (_UV, "<f4", 6)]
+            row += [(_UV_COUNT, "u1"), (_FACE_UV, "<f4", 6)]
         rows = np.zeros(len(fans.triangles), np.dtype(row))
-        rows["n"], rows["corners"] = 3, fans.triangles
+        rows[_COUNT], rows[_FACE] = 3, fans.triangles
         for name, array in face.items():
             rows[name] = array
         if self.corner_uv is not None:
-            rows["n of uv"], rows[_UV] = 6, self.corner_uv[fans.corners].reshape(-1, 6)
+            rows[_UV_COUNT] = 6
+            rows[_FACE_UV] = self.corner_uv[fans.corners].reshape(-1, 6)
         columns = [(name, a.dtype.newbyteorder("<")) for name, a in self.vertices.items()]
         vertices = np.zeros(len(self.points), np.dtype(columns))
         for name, array in self.vertices.items():
@@ -102,30 +106,42 @@ def ply_of(content: bytes) -> Ply:
     if beginning is None:
         raise ValueError("it does not begin with a line 'ply'")
     # After lines that a CR alone ends the numbers may begin with what looks like a LF.
-    end = re.compile(rb"end_header[ \t]*(?:" + beginning[1] + rb"|\r\n|\n)")
+    end = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:" + beginning[1] + rb"|\r\n|\n)")
     last = end.search(content, 0, _LONGEST_HEADER)
     if last is None:
         raise ValueError("no end of its header")
     header = re.split(r"[\r\n]+", _decoded(content[: last.start()]))
-    numbers = _numbers(header, content, last.end())
-    read: dict[str, dict[str, _Column]] = {}
-    for name, count, properties in _elements(header):
+    elements = _elements(header)
+    for name, count, _ in elements:
         if not 0 <= count <= len(content):
             raise ValueError(f"it announces {count} elements {name[:40]!r} in {len(content)} bytes")
-        read[name] = _element(numbers, name, count, properties)
-    if numbers.left:
-        raise ValueError(f"it holds {numbers.left} numbers more than its header announces")
+        if name in ("vertex", "face") and sum(name == other for other, *_ in elements) > 1:
+            raise ValueError(f"its header has more than one element {name!r}")
+    numbers = _numbers(header, content, last.end())
+    try:
+        read = _read(numbers, elements)
+    except ValueError:
+        start = last.end()
+        text = isinstance(numbers, _Text) and _without_more_columns(content[start:], elements)
+        if not text:
+            raise
+        read = _read(_Text(text), elements)
     vertex = {name: c.flat for name, c in read.get("vertex", {}).items() if not c.is_list}
     if not {"x", "y", "z"} <= vertex.keys():
         raise ValueError("it has no vertices with x, y and z")
     face = read.get("face", {})
-    listed = next((face[name] for name in _CORNERS if name in face), None)
+    lists = {name: column for name, column in face.items() if column.is_list}
+    listed = next((lists[name] for name in _CORNERS if name in lists), None)
     if listed is None:
         if face:
-            raise ValueError(f"its faces have no {_CORNERS[0]}")
+            raise ValueError(f"its faces have no list {_CORNERS[0]}")
         listed = _Column(counts=np.zeros(0, np.int64), flat=np.zeros(0, np.int64), is_list=True)
+    if listed.flat.dtype.kind == "f":
+        broken = np.isfinite(listed.flat) & (np.floor(listed.flat) != listed.flat)
+        if broken.any():
+            raise ValueError(f"a face has the vertex {listed.flat[broken][0]:g}")
     whole = np.abs(listed.flat.astype(np.float64)) <= np.iinfo(np.int32).max
-    uv = face.get(_UV)
+    uv = lists.get(_UV)
     each = uv is not None and bool((uv.counts == 2 * listed.counts).all())
     textures = (line.split(None, 2)[2] for line in header if _names_texture(line))
     return Ply(
@@ -166,6 +182,43 @@ def _elements(header: Sequence[str]) -> list[tuple[str, int, list[list[str]]]]:
     return elements
 
 
+_Elements = Sequence[tuple[str, int, list[list[str]]]]
+
+
+def _read(numbers: _Numbers, elements: _Elements) -> dict[str, dict[str, _Column]]:
+    read = {
+        name: _element(numbers, name, count, properties) for name, count, properties in elements
+    }
+    if numbers.left:
+        raise ValueError(f"it holds {numbers.left} numbers more than its header announces")
+    return read
+
+
+def _without_more_columns(content: bytes, elements: _Elements) -> bytes | None:
+    """Text of as many lines as rows are announced, without the columns behind those that are, where
+    all rows of an element have as many of these. None where it is not so."""
+    lines = [words for line in content.splitlines() if (words := line.split())]
+    if len(lines) != sum(count for _, count, _ in elements):
+        return None
+    kept: list[bytes] = []
+    for _, count, properties in elements:
+        rows, lines = lines[:count], lines[count:]
+        widths = [_width(row, properties) for row in rows]
+        if len({len(row) - width for row, width in zip(rows, widths, strict=True)}) > 1:
+            return None
+        kept += [b" ".join(row[:width]) for row, width in zip(rows, widths, strict=True)]
+    return b"\n".join(kept)
+
+
+def _width(row: Sequence[bytes], properties: Sequence[Sequence[str]]) -> int:
+    """Of how many words a row is to be, as far as it says so."""
+    width = 0
+    for words in properties:
+        listed = row[width] if words[0] == "list" and width < len(row) else b"0"
+        width += 1 + (int(listed) if listed.isdigit() else 0)
+    return width
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Column:
     """A property of all rows of an element: ``counts`` of each row, numbers ``flat``."""
@@ -177,6 +230,10 @@ class _Column:
 
 class _Numbers(Protocol):
     """The numbers behind a header, one after the other."""
+
+    @property
+    def of_counts(self) -> str:
+        """The kind in which counts of lists are taken, "" for that of the header."""
 
     @property
     def left(self) -> int:
@@ -196,6 +253,8 @@ class _Numbers(Protocol):
 
 
 class _Text:
+    of_counts = "f8"  # as they stand: of what is none nothing is made
+
     def __init__(self, content: bytes) -> None:
         try:
             self.numbers: Array = np.fromstring(content, np.float64, sep=" ")
@@ -249,6 +308,8 @@ def _of_kind(numbers: Array, kind: str) -> Array:
 
 
 class _Bytes:
+    of_counts = ""
+
     def __init__(self, content: bytes, place: int, order: str) -> None:
         self.content, self.place, self.order = content, place, order
 
@@ -281,7 +342,7 @@ class _Bytes:
 
 
 def _numbers(header: Sequence[str], content: bytes, start: int) -> _Numbers:
-    said = next((line.split()[1:2] for line in header if line.startswith("format ")), [])
+    said = next((line.split()[1:2] for line in header if line.split()[:1] == ["format"]), [])
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get("".join(said))
     if order is not None:
         return _Bytes(content, start, order)
@@ -299,8 +360,9 @@ def _element(
     numbers.back(start)
     kinds: list[tuple[str, int]] = []
     for words, length in zip(properties, lengths or [0] * len(properties), strict=True):
-        kinds += [(_KINDS[words[1]], 1), (_KINDS[words[2]], length)] if words[0] == "list" else []
-        kinds += [] if words[0] == "list" else [(_KINDS[words[0]], 1)]
+        if words[0] == "list":
+            kinds.append((numbers.of_counts or _KINDS[words[1]], 1))
+        kinds.append((_KINDS[words[-2]], length if words[0] == "list" else 1))
     if not kinds:
         return {}
     found: dict[str, _Column] = {}
@@ -336,9 +398,10 @@ def _one_by_one(
         for words, size, piece in zip(properties, sizes, pieces, strict=True):
             length = 1
             if words[0] == "list":
-                length = int(numbers.take(_KINDS[words[1]], 1)[0])
-                if length < 0:
-                    raise ValueError(f"a list has {length} elements")
+                said = float(numbers.take(numbers.of_counts or _KINDS[words[1]], 1)[0])
+                if not said.is_integer() or said < 0:
+                    raise ValueError(f"a list has {said:g} elements")
+                length = int(said)
             piece.append(numbers.take(_KINDS[words[-2]], length))
             size.append(length)
     return sizes, pieces

@@ -133,7 +133,13 @@ def frame_records(
     group_of = {c: g.get("label", "") for g in chunk.iterfind("cameras/group") for c in g}
     chunk_from_camera = {c.get("id", ""): numbers_of(c.find("transform"), 16) for c in cameras}
     shared = Counter(camera.get("label", "") for camera in filter(_is_enabled, cameras))
-    names_of: dict[Path, list[str]] = {}
+    # Those that are not aligned too: the picture may be theirs.
+    picture_of = {
+        camera: pictures.named(f"{group_of.get(camera, '')}/{label}") or pictures.named(label)
+        for camera in filter(_is_enabled, cameras)
+        if (label := camera.get("label", ""))
+    }
+    cameras_of = Counter(picture_of.values())
     records = []
     for camera in cameras:
         label = camera.get("label", "")
@@ -146,7 +152,7 @@ def frame_records(
             why = "its sensor is not calibrated" if sensor is None else "it has not been aligned"
             findings.drop(label, why, "capture.alignment")
             continue
-        image = pictures.named(f"{group_of.get(camera, '')}/{label}") or pictures.named(label)
+        image = picture_of.get(camera)
         if image is None and shared[label] > 1:
             said = f"{shared[label]} cameras have this label, and no picture or several this name"
             findings.drop(label, said, "capture.label")
@@ -154,7 +160,12 @@ def frame_records(
         if image is None:
             drop_without_picture(label, findings)
             continue
-        names_of.setdefault(image, []).append(label)
+        if cameras_of[image] > 1:
+            said = (
+                f"{cameras_of[image]} cameras have this label and one picture, which may be of any"
+            )
+            findings.drop(label, said, "capture.label")
+            continue
         pose = place_of(camera).pose(master.reshape(4, 4) @ sensor.master_from_sensor)
         records.append(
             FrameRecord(
@@ -167,12 +178,7 @@ def frame_records(
                 mask_path=pictures.mask_of(image, source.parent, options),
             )
         )
-    for names in (some for some in names_of.values() if len(some) > 1):
-        for name in names:
-            said = f"{len(names)} cameras have this label and one picture, which may be of any"
-            findings.drop(name, said, "capture.label")
-    known = (r for r in records if len(names_of[r.image_path]) == 1)
-    return sorted(known, key=lambda record: record.image_path)
+    return sorted(records, key=lambda record: record.image_path)
 
 
 def _chunk(document: Element, source: Path, findings: Findings) -> Element:

@@ -24,9 +24,8 @@ from usdbrdf.capture.parts import (
     scan_from_parts,
 )
 from usdbrdf.errors import ImageRefused, InputRefused, UsageError
-from usdbrdf.files.channels import layers_with_colours
 from usdbrdf.files.colour import kind_of_encoding
-from usdbrdf.files.images import RAW_SUFFIXES, image_size
+from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
 from usdbrdf.files.paths import contained
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -154,7 +153,7 @@ class Pictures:
         for path in self.paths:
             if digits := re.search(r"(\d+)$", path.stem):
                 found.setdefault(int(digits.group(1)), []).insert(0, path)
-        return {i: min(_in_colours(alike), key=_nearness) for i, alike in found.items()}
+        return {i: _nearest(alike)[0] for i, alike in found.items()}
 
 
 def _composed(name: str) -> str:
@@ -169,10 +168,21 @@ def _nearness(path: Path) -> int:
 
 def nearest_to_radiance(found: Sequence[Path]) -> Path | None:
     """Of pictures that may be the one that is meant; None where several of one kind are."""
-    found = _in_colours(found)
-    best = min(map(_nearness, found), default=0)
-    nearest = [path for path in found if _nearness(path) == best]
+    nearest = _nearest(found)
     return nearest[0] if len(nearest) == 1 else None
+
+
+def _nearest(found: Sequence[Path]) -> Sequence[Path]:
+    """Of several pictures of one name those with colours, as far as there are any: the others are
+    its depths, its normals or its mask, of whatever kind of file, and no frame can be read from
+    them. Of these the nearest to radiance; and of them those whose colours are no layer's."""
+    if len(found) < 2:
+        return found
+    kinds = {path: _kind_of_colours(path) for path in found}
+    found = [path for path in found if kinds[path]] or found
+    best = min(map(_nearness, found))
+    found = [path for path in found if _nearness(path) == best]
+    return [path for path in found if kinds[path] == max(kinds[path] for path in found)]
 
 
 def _or_radiance(path: Path, alike: Sequence[Path], instead: dict[Path, Path]) -> Path:
@@ -188,20 +198,14 @@ def _or_radiance(path: Path, alike: Sequence[Path], instead: dict[Path, Path]) -
 
 def _is_radiance(path: Path) -> bool:
     """Whether a picture beside a photograph is its radiance: without colours it is its depths."""
-    return path.suffix.lower() in _RADIANCE and _has_colours(path)
+    return path.suffix.lower() in _RADIANCE and _kind_of_colours(path) > 0
 
 
-def _in_colours(found: Sequence[Path]) -> Sequence[Path]:
-    """Of several pictures of one name those with colours, as far as there are any: the others are
-    its depths or its mask, of whatever kind of file, and no frame can be read from them."""
-    return (len(found) > 1 and [path for path in found if _has_colours(path)]) or found
-
-
-def _has_colours(path: Path) -> bool:
+def _kind_of_colours(path: Path) -> int:
     try:
-        return bool(layers_with_colours(image_size(path)[2]))
+        return kind_of_colours(path)
     except ImageRefused:  # of which the reader of its pixels will tell
-        return True
+        return 2
 
 
 def warn_of_radiance(instead: Mapping[Path, Path], findings: Findings, source: Path) -> None:

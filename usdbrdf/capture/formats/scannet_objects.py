@@ -38,7 +38,8 @@ def annotated_objects(segments: Path, groups: Path) -> Callable[[FileMesh], Labe
 
 
 def _groups(path: Path) -> tuple[dict[int, ObjectName], dict[int, int]]:
-    """Name and class of each object, and the object of each segment: of several, the smallest."""
+    """Name and class of each object, and the object of each segment: of several, the smallest.
+    Numbers below 0 are no object's, as what is in none has -1."""
     document: Any = read_json(path)
     rows: Any = document.get("segGroups") if isinstance(document, dict) else None
     sound = isinstance(rows, list) and all(
@@ -55,6 +56,8 @@ def _groups(path: Path) -> tuple[dict[int, ObjectName], dict[int, int]]:
     entries, object_of_segment = {}, {}
     for row in sorted(rows, key=lambda row: -len(row["segments"])):
         number, label = row.get("objectId", row.get("id")), str(row.get("label") or "")
+        if number < 0:
+            continue
         entries[number] = ObjectName(f"{label or 'object'}_{number}", label)
         object_of_segment.update(dict.fromkeys(row["segments"], number))
     return entries, object_of_segment
