@@ -128,8 +128,17 @@ def test_what_surfaces_mirror_is_not_taken_for_light_in_their_shadows(sunny):
         assert found is not None
         return float(np.abs(found.environment.sun.irradiance / SUN.irradiance - 1).mean())
 
-    # What is told is what usual dielectrics would mirror; these mirror 0.8 of that.
-    assert off(lambda outside, index: sheen[index] / 0.8) < 0.75 * off()
+    asked_about = []
+
+    def mirrored(outside: Environment, index: np.ndarray) -> np.ndarray:
+        asked_about.append(outside)
+        return sheen[index]
+
+    assert off(mirrored) < 0.75 * off()
+    # It follows from the light that was found before, sun and all.
+    assert len(asked_about) >= 2
+    assert all(outside.sun.irradiance.min() > 1 for outside in asked_about)
+    assert np.abs(asked_about[1].sun.irradiance - asked_about[0].sun.irradiance).max() > 0
 
 
 def test_no_sun_is_found_where_none_shines(yard):
