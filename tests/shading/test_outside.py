@@ -116,7 +116,7 @@ def test_what_surfaces_mirror_is_not_taken_for_light_in_their_shadows(sunny):
     surface, lit, albedo = sunny
     # From everywhere the same light, next to which what shadows scatter is little.
     sheen = 0.04 * np.median(lit, axis=0)
-    sheen = np.pi * np.where(albedo.mean(axis=1) < 0.45, 1.0, 0.5)[:, None] * sheen * [3, 5, 8]
+    sheen = np.pi * np.where(albedo.mean(axis=1) < 0.45, 1.0, 0.5)[:, None] * 3 * sheen
     every = np.ones(len(lit), np.bool_)
     shown = lit + (sheen / np.pi).astype(np.float32)
     seen = _seen(np.abs(_UP) < 0.3)
@@ -126,7 +126,9 @@ def test_what_surfaces_mirror_is_not_taken_for_light_in_their_shadows(sunny):
             surface, shown, CoverageMap.of(every, ~every), seen, True, 3, mirrored
         )
         assert found is not None
-        return float(np.abs(found.environment.sun.irradiance / SUN.irradiance - 1).mean())
+        sun = found.environment.sun.irradiance / SUN.irradiance
+        sky = _of_upper_half(found.environment.image) / _of_upper_half(SKY)
+        return float(np.abs(sun / sky - 1).mean())  # next to nothing tells the level
 
     asked_about = []
 
@@ -134,7 +136,7 @@ def test_what_surfaces_mirror_is_not_taken_for_light_in_their_shadows(sunny):
         asked_about.append(outside)
         return sheen[index]
 
-    assert off(mirrored) < 0.75 * off()
+    assert off(mirrored) < 0.6 * off()
     # It follows from the light that was found before, sun and all.
     assert len(asked_about) >= 2
     assert all(outside.sun.irradiance.min() > 1 for outside in asked_about)
