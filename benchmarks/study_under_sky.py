@@ -19,28 +19,29 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "samples"))
-from make_study import Lens, mitsuba_shape, render, write_json, write_mesh, write_objects
-from study_camera import (
-    EXPOSURES,
-    Array,
-    noise_floor_radiance,
-    photograph,
-    saturation_radiance,
-    write_exr,
+from make_study import (
+    Lens,
+    mitsuba_scene,
+    render,
+    write_frames,
+    write_json,
+    write_mesh,
+    write_objects,
 )
+from study_camera import EXPOSURES, Array, saturation_radiance, write_exr
 from study_scene import StudyObject
+from study_shapes import joined
 
+from usdbrdf.model.camera import Camera
 from usdbrdf.transport.rays import RayScene
 
 import mitsuba as mi  # isort: skip  (its variant is set by make_study)
 from true_scene import true_objects  # isort: skip
 
-MAX_DEPTH, ROULETTE_DEPTH = 14, 4
 HEIGHT, WIDTH = 512, 1024
 SUN_DEGREES = 1.0
 # The middle exposure saturates at so many times the brightest tenth of ordinary pixels.
@@ -71,7 +72,8 @@ def main() -> int:
     document = json.loads((options.capture / "transforms.json").read_text("utf-8"))
     lens = Lens(document["w"], document["h"], document["fl_x"])
     poses = [np.array(frame["transform_matrix"]) for frame in document["frames"]]
-    rays = ray_scene(objects)
+    points, triangles = joined([(item.points, item.triangles) for item in objects])
+    rays = RayScene(points.astype(np.float32), triangles.astype(np.int32))
     outwards = [sees_sky(rays, pose, lens) for pose in poses]
     if options.inside:
         poses = [pose for pose, outward in zip(poses, outwards, strict=True) if not outward]
@@ -79,29 +81,15 @@ def main() -> int:
         parser.error(f"--inside: every frame of {options.capture} sees the sky.")
     poses = spread(poses, options.frames)
     sky *= brightness(objects, sky, poses, lens)
-    scene = mitsuba_scene(objects, sky)
+    scene = under(objects, sky)
     for folder in ("frames", "truth"):
         (options.output / folder).mkdir(parents=True)
     write_mesh(options.output / "mesh.ply", objects)
     write_objects(options.output, objects)
     write_exr(options.output / "truth/environment.exr", sky)
     header = {key: value for key, value in document.items() if key != "frames"}
-    records = []
-    for k, pose in enumerate(poses):
-        exposure = EXPOSURES[k % len(EXPOSURES)]
-        clean = render(scene, pose, options.samples, SEED + k, lens)
-        name = f"frames/{k:04d}.exr"
-        picture = photograph(clean, exposure, np.random.default_rng([SEED, k]))
-        write_exr(options.output / name, picture, exposure)
-        records.append(
-            {
-                "file_path": name,
-                "transform_matrix": pose.tolist(),
-                "exposure_time": exposure,
-                "saturation_radiance": saturation_radiance(exposure),
-                "noise_floor_radiance": noise_floor_radiance(exposure),
-            }
-        )
+    exposed = [(pose, EXPOSURES[k % len(EXPOSURES)]) for k, pose in enumerate(poses)]
+    records = write_frames(options.output, scene, options.samples, exposed, SEED, lens)
     write_json(options.output / "transforms.json", header | {"frames": records})
     held_out(options, scene, lens)
     print(f"{len(poses)} frames, {sum(outwards)} of the capture's {len(outwards)} see the sky")
@@ -112,13 +100,6 @@ def spread(poses: list[Array], count: int) -> list[Array]:
     """At most so many, spread over all."""
     chosen = np.linspace(0, len(poses) - 1, min(len(poses), count)).astype(int)
     return [poses[k] for k in chosen]
-
-
-def ray_scene(objects: list[StudyObject]) -> RayScene:
-    starts = np.cumsum([0] + [len(item.points) for item in objects])
-    triangles = [item.triangles + start for item, start in zip(objects, starts, strict=False)]
-    points = np.concatenate([item.points for item in objects])
-    return RayScene(points.astype(np.float32), np.concatenate(triangles).astype(np.int32))
 
 
 def sun_and_sky(elevation: float, azimuth: float, share: float) -> Array:
@@ -154,32 +135,24 @@ def directions(polar: Array, turn: Array) -> Array:
 TO_WORLD = [[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
 
 
-def mitsuba_scene(objects: list[StudyObject], sky: Array | None) -> mi.Scene:
-    scene: dict[str, Any] = {"type": "scene"}
-    scene["integrator"] = {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH}
-    scene |= {item.name: mitsuba_shape(item) for item in objects}
-    if sky is not None:
-        bitmap = mi.Bitmap(np.ascontiguousarray(sky, np.float32))
-        turned = mi.ScalarTransform4f(TO_WORLD)
-        scene["sky"] = {"type": "envmap", "bitmap": bitmap, "to_world": turned}
-    return mi.load_dict(scene)
+def under(objects: list[StudyObject], sky: Array) -> mi.Scene:
+    bitmap = mi.Bitmap(np.ascontiguousarray(sky, np.float32))
+    turned = mi.ScalarTransform4f(TO_WORLD)
+    return mitsuba_scene(objects, {"sky": {"type": "envmap", "bitmap": bitmap, "to_world": turned}})
 
 
 def sees_sky(rays: RayScene, pose: Array, lens: Lens) -> bool:
     """Whether any pixel's middle misses all surfaces."""
-    y, x = np.mgrid[: lens.height, : lens.width] + 0.5
-    towards = np.stack(
-        [x - lens.width / 2, lens.height / 2 - y, np.full_like(x, -lens.focal)], axis=-1
+    intrinsics = lens.focal, lens.focal, lens.width / 2, lens.height / 2
+    camera = Camera(
+        world_from_camera=pose, intrinsics=intrinsics, width=lens.width, height=lens.height
     )
-    towards = (towards.reshape(-1, 3) @ pose[:3, :3].T).astype(np.float32)
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    origin = np.broadcast_to(pose[:3, 3].astype(np.float32), towards.shape)
-    return bool((rays.closest(np.ascontiguousarray(origin), towards).face < 0).any())
+    return bool((rays.closest(*camera.rays(camera.pixels())).face < 0).any())
 
 
 def brightness(objects: list[StudyObject], sky: Array, poses: list[Array], lens: Lens) -> float:
     """What the sky is to be multiplied by for the frames' middle exposure to suit them."""
-    scene = mitsuba_scene(objects, sky)
+    scene = under(objects, sky)
     looked = (render(scene, pose, 16, SEED, lens) for pose in spread(poses, LOOKED_AT))
     pixels = np.concatenate([picture.max(axis=-1).ravel() for picture in looked])
     return float(saturation_radiance(EXPOSURES[1]) / HEADROOM / np.percentile(pixels, BRIGHT))

@@ -23,7 +23,9 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import mitsuba as mi
@@ -84,8 +86,11 @@ def mitsuba_shape(item: StudyObject) -> mi.Mesh:
     return shape
 
 
-def mitsuba_scene(objects: list[StudyObject]) -> mi.Scene:
-    scene: dict[str, Any] = {"type": "scene"}
+def mitsuba_scene(
+    objects: list[StudyObject], others: Mapping[str, Any] = MappingProxyType({})
+) -> mi.Scene:
+    """The objects, and ``others`` in Mitsuba's words."""
+    scene: dict[str, Any] = {"type": "scene", **others}
     scene["integrator"] = {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": ROULETTE_DEPTH}
     scene |= {item.name: mitsuba_shape(item) for item in objects}
     return mi.load_dict(scene)

@@ -220,12 +220,17 @@ class AssetMaps:
         return np.asarray((self.emission > 0).any(axis=1), np.bool_)
 
     @property
+    def hidden(self) -> Bool:
+        """(T,): no frame shows the texel, and it does not shine."""
+        return ~(self.coverage.observed | self.emissive)
+
+    @property
     def light(self) -> Float:
         """(T, 3) W/(m^2 sr): what the surface sends out: L_d, and what shading found of lamps (of
         those that clipped in every frame L_d is only a lower bound) and of what no frame shows."""
         light = np.where(self.emissive[:, None], self.emission, self.lit)
         if self.has("hidden"):
-            hidden = ~(self.coverage.observed | self.emissive)
+            hidden = self.hidden
             light[hidden] = self.map_where_present("hidden", 3)[hidden]
         return light
 
@@ -274,8 +279,7 @@ class AssetMaps:
         error = np.array(of_object, np.float32)[self.texels.object_index()]
         inferred = self.emissive & ~self.coverage.measured & (error > 0)
         light = np.where(inferred[:, None], error[:, None] * self.emission, np.float32(0))
-        hidden = ~(self.coverage.observed | self.emissive)
-        light[hidden] = _OF_HIDDEN * self.light[hidden]
+        light[self.hidden] = _OF_HIDDEN * self.light[self.hidden]
         outside = self._doubts_of_outside() if asked == ESTIMATE else black_environment()
         if not (light.any() or outside.image.any() or outside.sun.shines):
             return None

@@ -202,17 +202,16 @@ def light_from_outside(
         found = solved(*with_sun)
         light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
     assert sun is not None
-    for _ in range(_LOOKS_AT_MIRRORED):
-        if mirrored is None:
-            break
-        strengths: Double = np.exp(found.log_radiance)
-        outside = Environment(_picture(seen, patches, used, strengths[:-1], z_up), z_up)
-        in_sun = outside.under(sun._replace(irradiance=strengths[-1]))
-        asked = asked._replace(mirrored=mirrored(in_sun, asked.texel))
-        sky = sky._replace(gloss=_AS_TOLD)
-        with_sun = _with_sun(surface, asked, sky, sun, seed)
-        found = solved(*with_sun)
-    light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
+    if mirrored is not None:
+        for _ in range(_LOOKS_AT_MIRRORED):
+            strengths: Double = np.exp(found.log_radiance)
+            outside = Environment(_picture(seen, patches, used, strengths[:-1], z_up), z_up)
+            in_sun = outside.under(sun._replace(irradiance=strengths[-1]))
+            asked = asked._replace(mirrored=mirrored(in_sun, asked.texel))
+            sky = sky._replace(gloss=_AS_TOLD)
+            with_sun = _with_sun(surface, asked, sky, sun, seed)
+            found = solved(*with_sun)
+        light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
     strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
     error = jackknife(*with_sun, found)
     # What no texel sees keeps what was thought of it before, and errs by nothing.
