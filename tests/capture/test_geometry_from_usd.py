@@ -147,6 +147,61 @@ def test_polygons_normals_and_handedness(tmp_path):
     assert ((facing[:, None] * mesh.corner_normals).sum(axis=2) > 0).all()
 
 
+def test_polygons_that_are_not_convex_are_cut_with_all_that_goes_with_them(capture, tmp_path):
+    """The floor is made an L of six corners and the rest of the square: the fan from the L's first
+    corner would cover what is not of it."""
+    stage = Usd.Stage.Open(str(capture.folder / "room.usda"))
+    floor = UsdGeom.Mesh(stage.GetPrimAtPath("/scan/floor/surface"))
+    z = float(np.array(floor.GetPointsAttr().Get())[:, 2].min())
+    outline = [(1, 3), (0, 3), (0, 0), (4, 0), (4, 1), (1, 1)]
+    points = [(x, y, z) for x, y in [*outline, (4, 3)]]
+    floor.GetPointsAttr().Set([Gf.Vec3f(*point) for point in points])
+    floor.GetFaceVertexCountsAttr().Set([6, 4])
+    corners = [0, 1, 2, 3, 4, 5, 5, 4, 6, 0]
+    floor.GetFaceVertexIndicesAttr().Set(corners)
+    primvars = UsdGeom.PrimvarsAPI(floor.GetPrim())
+    types = Sdf.ValueTypeNames
+    at = primvars.CreatePrimvar("at", types.Float3Array, "faceVarying")
+    at.Set([Gf.Vec3f(*points[corner]) for corner in corners])
+    primvars.CreatePrimvar("of", types.IntArray, "uniform").Set([6, 4])
+    UsdGeom.Subset.CreateGeomSubset(floor, "L", "face", [0], "materialBind")
+    UsdGeom.Subset.CreateGeomSubset(floor, "rest", "face", [1], "materialBind")
+    stage.Save()
+    scan = read_scan(capture.folder, IngestOptions())
+    own = scan.mesh.triangles[scan.mesh.face_object == capture.names.index("floor")]
+    across = _across(scan.mesh.points[own])
+    assert (across[:, 2] > 0).all()
+    assert across[:4, 2].sum() == pytest.approx(2 * 6)
+    asset = Asset(tmp_path / "asset", "asset")
+    ingest(capture.folder, asset, IngestOptions())
+    ours = open_weaker(asset, "texturing")
+    scene = scene_from_stage(ours)
+    np.testing.assert_allclose(
+        scene.points[scene.triangles], scan.mesh.points[scan.mesh.triangles], atol=1e-6
+    )
+    mesh = next(
+        UsdGeom.Mesh(prim)
+        for prim in ours.Traverse()
+        if prim.IsA(UsdGeom.Mesh) and "floor" in str(prim.GetPath())
+    )
+    assert set(mesh.GetFaceVertexCountsAttr().Get()) == {3}
+    used = np.array(mesh.GetFaceVertexIndicesAttr().Get())
+    primvars = UsdGeom.PrimvarsAPI(mesh.GetPrim())
+    np.testing.assert_array_equal(
+        np.array(primvars.GetPrimvar("at").ComputeFlattened()), np.float32(points)[used]
+    )
+    assert list(primvars.GetPrimvar("of").Get()) == [6, 6, 6, 6, 4, 4]
+    subsets = {s.GetPrim().GetName(): s for s in UsdGeom.Subset.GetAllGeomSubsets(mesh)}
+    assert list(subsets["L"].GetIndicesAttr().Get()) == [0, 1, 2, 3]
+    assert list(subsets["rest"].GetIndicesAttr().Get()) == [4, 5]
+
+
+def _across(corners):
+    """Along the normals of triangles (F, 3, 3), twice as long as their areas are large."""
+    first, second, third = np.moveaxis(corners.astype(float), 1, 0)
+    return np.cross(second - first, third - first)
+
+
 def test_instances_are_objects_one_by_one(tmp_path):
     stage = _stage(tmp_path / "a.usda")
     stage.CreateClassPrim("/chair")

@@ -328,7 +328,9 @@ def _world_part(mesh: Any, transform: Any, time: Any, path: Path) -> tuple[Float
     mirrored = bool(np.linalg.det(matrix[:3, :3]) < 0)
     left_handed = mesh.GetOrientationAttr().Get(time) == UsdGeom.Tokens.leftHanded
     holes = numbers_of(mesh.GetHoleIndicesAttr().Get(time), np.int32)
-    fans = triangulate(counts, indices, left_handed=left_handed != mirrored, holes=holes)
+    fans = triangulate(
+        counts, indices, left_handed=left_handed != mirrored, holes=holes, points=points
+    )
     world = points @ matrix[:3, :3] + matrix[3, :3]
     normals = np.full((len(fans.triangles), 3, 3), np.nan, np.float32)
     local = _authored_normals(mesh, fans, len(points), len(counts), len(indices), time)

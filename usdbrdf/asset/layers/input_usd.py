@@ -129,7 +129,8 @@ def _author_triangles(
         return
     indices = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(_FIRST), np.int32)
     # The winding stays as the file says: its orientation still applies.
-    fans = triangulate(counts, indices, holes=holes)
+    points = np.asarray(mesh.GetPointsAttr().Get(_FIRST), np.float64)
+    fans = triangulate(counts, indices, holes=holes, points=points)
     for corners in (fans.triangles, fans.corners):
         corners[turned] = corners[turned][:, [0, 2, 1]]
     prim = over(layer, path)

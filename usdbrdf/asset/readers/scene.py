@@ -240,11 +240,15 @@ def per_corner(
 
 def triangulation_of(mesh: UsdGeom.Mesh) -> Triangulation:
     """The mesh as triangles, counter-clockwise seen from outside, in its own frame."""
+    points = numbers_of(mesh.GetPointsAttr().Get(_TIME), np.float64, 3)
+    indices = numbers_of(mesh.GetFaceVertexIndicesAttr().Get(_TIME), np.int32)
+    there = indices.size and indices.min() >= 0 and indices.max() < len(points)
     return triangulate(
         numbers_of(mesh.GetFaceVertexCountsAttr().Get(_TIME), np.int32),
-        numbers_of(mesh.GetFaceVertexIndicesAttr().Get(_TIME), np.int32),
+        indices,
         left_handed=mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded,
         holes=numbers_of(mesh.GetHoleIndicesAttr().Get(_TIME), np.int32),
+        points=points if there else None,
     )
 
 
