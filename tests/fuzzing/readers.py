@@ -226,14 +226,14 @@ READERS = {
                 name=kind,
                 seeds=getattr(seeds, kind),
                 read=_mesh_and_model,
-                lines=("usdbrdf.untrusted.mesh_files", of_kind),
+                lines=("usdbrdf.untrusted.mesh_files", *of_kind),
                 in_child=True,
                 unknown=frozenset(("corner_normals",)),
             )
             for kind, of_kind in (
-                ("ply", "usdbrdf.untrusted.mesh_ply"),
-                ("obj", "usdbrdf.untrusted.mesh_text"),
-                ("glb", "usdbrdf.untrusted.mesh_gltf:geometry_not_read,_bent"),
+                ("ply", ("usdbrdf.untrusted.mesh_ply", "usdbrdf.untrusted.ply_numbers")),
+                ("obj", ("usdbrdf.untrusted.mesh_text",)),
+                ("glb", ("usdbrdf.untrusted.mesh_gltf:geometry_not_read,_bent",)),
             )
         ),
         Reader(

@@ -17,6 +17,7 @@ from usdbrdf.model.mesh import triangulate
 from usdbrdf.model.polygons import ears
 from usdbrdf.untrusted import bounds
 from usdbrdf.untrusted.mesh_files import FileMesh, checked_mesh, mesh_from_file, model_from_file
+from usdbrdf.untrusted.mesh_ply import ply_of
 
 _SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
@@ -87,6 +88,68 @@ def test_binary_triangles_beside_quads_are_read(tmp_path, order):
     path.write_bytes(content[:-3])
     with pytest.raises(InputRefused, match=r"\[mesh\.read\]$"):
         mesh_from_file(path)
+
+
+@pytest.mark.parametrize("order", ["<", ">", "ascii"])
+@pytest.mark.parametrize("counts", [("uchar", "B"), ("int", "i"), ("float", "f")])
+def test_many_faces_of_several_sizes_take_no_time(tmp_path, order, counts):
+    rng = np.random.default_rng(1)
+    kind, packed = counts
+    sizes = rng.integers(3, 6, 60_000)
+    faces = [np.arange(size) + 5 * (i % 1000) for i, size in enumerate(sizes.tolist())]
+    turns = np.array([0, 1, 2, 3, 4]) * 1.2
+    points = np.stack([np.cos(turns), np.sin(turns), 0 * turns], axis=1)
+    points = np.tile(points, (1000, 1)).astype("f4")
+    named = {"<": "binary_little_endian", ">": "binary_big_endian"}.get(order, order)
+    head = (
+        f"ply\nformat {named} 1.0\nelement vertex 5000\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face 60000\nproperty short material\n"
+        f"property list {kind} int vertex_indices\nproperty int object_id\nend_header\n"
+    )
+    if order == "ascii":
+        rows = [f"{x} {y} {z}" for x, y, z in points.tolist()]
+        rows += [f"7 {len(f)} {' '.join(map(str, f))} {i}" for i, f in enumerate(faces)]
+        body = ("\n".join(rows) + "\n").encode()
+    else:
+        body = points.astype(f"{order}f4").tobytes()
+        for i, face in enumerate(faces):
+            body += struct.pack(f"{order}h{packed}{len(face)}ii", 7, len(face), *face, i)
+    start = time.process_time()
+    ply = ply_of(head.encode() + body)
+    assert time.process_time() - start < 0.6
+    assert ply.counts.tolist() == sizes.tolist()
+    assert ply.corners.tolist() == np.concatenate(faces).tolist()
+    assert ply.faces["object_id"].tolist() == list(range(60_000))
+    assert set(ply.faces["material"].tolist()) == {7}
+    if order != "ascii":
+        with pytest.raises(ValueError, match="ends within a face"):
+            ply_of(head.encode() + body[:-1])
+
+
+@pytest.mark.parametrize("order", ["<", ">", "ascii"])
+def test_strips_of_triangles_are_faces(tmp_path, order):
+    """As Stanford's scans have them: what is below 0 ends a strip, a vertex twice leads it on."""
+    strips = [[0, 1, 2, 3, -1, 2, 3, 4, 5, 5, 0, -1], [4, 3, 0]]
+    named = {"<": "binary_little_endian", ">": "binary_big_endian"}.get(order, order)
+    head = (
+        f"ply\nformat {named} 1.0\nelement vertex 6\nproperty float x\nproperty float y\n"
+        "property float z\nelement tristrips 2\nproperty list int int vertex_indices\nend_header\n"
+    )
+    points = np.array([(i % 2, i // 2, 0) for i in range(6)], f"{order[:1].strip('a')}f4")
+    if order == "ascii":
+        rows = [*points.tolist(), *([len(strip), *strip] for strip in strips)]
+        body = "\n".join(" ".join(map(str, row)) for row in rows).encode()
+    else:
+        body = points.tobytes()
+        for strip in strips:
+            body += struct.pack(f"{order}{len(strip) + 1}i", len(strip), *strip)
+    path = tmp_path / "dragon.ply"
+    path.write_bytes(head.encode() + body)
+    expected = [[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5], [4, 3, 0]]
+    assert mesh_from_file(path).triangles.tolist() == expected
+    (surface,) = model_from_file(path)
+    assert surface.triangles.tolist() == expected
+    assert surface.points.tolist() == points.tolist()
 
 
 @pytest.mark.parametrize("order", ["<", ">", "ascii"])

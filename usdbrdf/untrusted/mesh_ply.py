@@ -7,24 +7,19 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from usdbrdf.model.arrays import Array, Double, Long
 from usdbrdf.model.mesh import Triangulation, triangulate
+from usdbrdf.untrusted.ply_numbers import KINDS, Column, Numbers, Text, element, numbers_behind
 
-# PLY's names of numbers, as NumPy spells them.
-_KINDS = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
-    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "int64": "i8", "uint64": "u8", "float16": "f2", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
-_NAMES = {kind: name for name, kind in reversed(_KINDS.items())}
+_NAMES = {kind: name for name, kind in reversed(KINDS.items())}
 _BEGINNING = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
 _LONGEST_HEADER = 1 << 16
 _CORNERS, _UV = ("vertex_indices", "vertex_index"), "texcoord"
+_STRIPS = "tristrips"  # in place of faces, as Stanford's scans have them
 # Columns of a file's rows beside those that it names itself: no word of a header has blanks.
 _COUNT, _FACE, _UV_COUNT, _FACE_UV = "corners of each", "the corners", "uv of each", "the uv"
 
@@ -115,43 +110,73 @@ def ply_of(content: bytes) -> Ply:
     for name, count, _ in elements:
         if not 0 <= count <= len(content):
             raise ValueError(f"it announces {count} elements {name[:40]!r} in {len(content)} bytes")
-        if name in ("vertex", "face") and sum(name == other for other, *_ in elements) > 1:
+        if name in ("vertex", "face", _STRIPS) and sum(name == other for other, *_ in elements) > 1:
             raise ValueError(f"its header has more than one element {name!r}")
-    numbers = _numbers(header, content, last.end())
+    numbers = numbers_behind(header, content, last.end())
     try:
         read = _read(numbers, elements)
     except ValueError:
         start = last.end()
-        text = isinstance(numbers, _Text) and _without_more_columns(content[start:], elements)
+        text = isinstance(numbers, Text) and _without_more_columns(content[start:], elements)
         if not text:
             raise
-        read = _read(_Text(text), elements)
+        read = _read(Text(text), elements)
     vertex = {name: c.flat for name, c in read.get("vertex", {}).items() if not c.is_list}
     if not {"x", "y", "z"} <= vertex.keys():
         raise ValueError("it has no vertices with x, y and z")
-    face = read.get("face", {})
+    of_strips = not _rows(read.get("face", {})) and _rows(read.get(_STRIPS, {})) > 0
+    face = read.get(_STRIPS if of_strips else "face", {})
     lists = {name: column for name, column in face.items() if column.is_list}
     listed = next((lists[name] for name in _CORNERS if name in lists), None)
     if listed is None:
         if face:
             raise ValueError(f"its faces have no list {_CORNERS[0]}")
-        listed = _Column(counts=np.zeros(0, np.int64), flat=np.zeros(0, np.int64), is_list=True)
+        listed = Column(counts=np.zeros(0, np.int64), flat=np.zeros(0, np.int64), is_list=True)
     if listed.flat.dtype.kind == "f":
         broken = np.isfinite(listed.flat) & (np.floor(listed.flat) != listed.flat)
         if broken.any():
             raise ValueError(f"a face has the vertex {listed.flat[broken][0]:g}")
     whole = np.abs(listed.flat.astype(np.float64)) <= np.iinfo(np.int32).max
+    corners = np.where(whole, listed.flat, -1).astype(np.int64)
+    if of_strips:
+        triangles = _triangles_of_strips(listed.counts, corners)
+        return Ply(
+            vertices=vertex,
+            counts=np.full(len(triangles), 3, np.int64),
+            corners=triangles.reshape(-1),
+            faces={},
+        )
     uv = lists.get(_UV)
     each = uv is not None and bool((uv.counts == 2 * listed.counts).all())
     textures = (line.split(None, 2)[2] for line in header if _names_texture(line))
     return Ply(
         vertices=vertex,
         counts=listed.counts,
-        corners=np.where(whole, listed.flat, -1).astype(np.int64),
+        corners=corners,
         faces={name: c.flat for name, c in face.items() if not c.is_list},
         corner_uv=uv.flat.reshape(-1, 2).astype(np.float64) if uv is not None and each else None,
         texture=next(textures, "").strip(),
     )
+
+
+def _rows(element: dict[str, Column]) -> int:
+    return len(next(iter(element.values())).counts) if element else 0
+
+
+def _triangles_of_strips(counts: Long, corners: Long) -> Long:
+    """(T, 3) of strips in which each vertex makes a triangle with the two before it, every other
+    one wound the other way; what is below 0 ends one and begins the next. Those that have a vertex
+    twice only lead a strip elsewhere."""
+    strip = np.full(len(corners) + len(counts), -1, np.int64)
+    strip[np.arange(len(corners)) + np.repeat(np.arange(len(counts)), counts)] = corners
+    place = np.arange(len(strip))
+    since = place - np.maximum.accumulate(np.where(strip < 0, place + 1, 0))
+    triangles = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
+    odd = since[:-2] % 2 == 1
+    triangles[odd] = triangles[odd][:, [1, 0, 2]]
+    first, second, third = triangles.T
+    apart = (first != second) & (second != third) & (third != first)
+    return np.asarray(triangles[(triangles >= 0).all(axis=1) & apart], np.int64)
 
 
 def _names_texture(line: str) -> bool:
@@ -174,7 +199,7 @@ def _elements(header: Sequence[str]) -> list[tuple[str, int, list[list[str]]]]:
         if words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"] and elements and (listed or len(kinds) == 1):
-            if unknown := next((kind for kind in kinds[listed:] if kind not in _KINDS), ""):
+            if unknown := next((kind for kind in kinds[listed:] if kind not in KINDS), ""):
                 raise ValueError(f"it has numbers of an unknown kind, {unknown[:40]!r}")
             elements[-1][2].append(words[1:])
         elif words[:1] in (["element"], ["property"]):
@@ -185,10 +210,8 @@ def _elements(header: Sequence[str]) -> list[tuple[str, int, list[list[str]]]]:
 _Elements = Sequence[tuple[str, int, list[list[str]]]]
 
 
-def _read(numbers: _Numbers, elements: _Elements) -> dict[str, dict[str, _Column]]:
-    read = {
-        name: _element(numbers, name, count, properties) for name, count, properties in elements
-    }
+def _read(numbers: Numbers, elements: _Elements) -> dict[str, dict[str, Column]]:
+    read = {name: element(numbers, name, count, properties) for name, count, properties in elements}
     if numbers.left:
         raise ValueError(f"it holds {numbers.left} numbers more than its header announces")
     return read
@@ -217,191 +240,3 @@ def _width(row: Sequence[bytes], properties: Sequence[Sequence[str]]) -> int:
         listed = row[width] if words[0] == "list" and width < len(row) else b"0"
         width += 1 + (int(listed) if listed.isdigit() else 0)
     return width
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Column:
-    """A property of all rows of an element: ``counts`` of each row, numbers ``flat``."""
-
-    counts: Long
-    flat: Array
-    is_list: bool
-
-
-class _Numbers(Protocol):
-    """The numbers behind a header, one after the other."""
-
-    @property
-    def of_counts(self) -> str:
-        """The kind in which counts of lists are taken, "" for that of the header."""
-
-    @property
-    def left(self) -> int:
-        """How many bytes or numbers nobody has taken."""
-
-    def take(self, kind: str, count: int) -> Array:
-        """(count,) of one kind; ValueError where there are less."""
-
-    def table(self, kinds: Sequence[tuple[str, int]], rows: int) -> list[Array] | None:
-        """Rows of the same length: of each of its parts, a kind and how many, (rows, how many).
-        None, and nothing is taken, where there are less."""
-
-    def back(self, place: int) -> None:
-        """Go back to a place."""
-
-    place: int
-
-
-class _Text:
-    of_counts = "f8"  # as they stand: of what is none nothing is made
-
-    def __init__(self, content: bytes) -> None:
-        try:
-            self.numbers: Array = np.fromstring(content, np.float64, sep=" ")
-        except ValueError as error:
-            raise ValueError(f"it holds {_no_number(content)}, which is no number") from error
-        self.place = 0
-
-    @property
-    def left(self) -> int:
-        return len(self.numbers) - self.place
-
-    def take(self, kind: str, count: int) -> Array:
-        if not 0 <= count <= self.left:
-            raise ValueError("it ends within a face")
-        self.place += count
-        return _of_kind(self.numbers[self.place - count : self.place], kind)
-
-    def table(self, kinds: Sequence[tuple[str, int]], rows: int) -> list[Array] | None:
-        ends = np.cumsum([count for _, count in kinds]).tolist()
-        if rows * ends[-1] > self.left:
-            return None
-        part = self.numbers[self.place : self.place + rows * ends[-1]].reshape(rows, ends[-1])
-        self.place += part.size
-        return [
-            _of_kind(part[:, end - count : end], kind)
-            for (kind, count), end in zip(kinds, ends, strict=True)
-        ]
-
-    def back(self, place: int) -> None:
-        self.place = place
-
-
-def _no_number(content: bytes) -> str:
-    for word in content.split():
-        try:
-            float(word)
-        except ValueError:
-            return repr(word[:40].decode("latin-1"))
-    return "something"
-
-
-def _of_kind(numbers: Array, kind: str) -> Array:
-    """Numbers that were written as text. Whole ones that are none, or too large, become -1, or what
-    is largest where nothing is below 0."""
-    if kind[0] == "f":
-        with np.errstate(over="ignore"):
-            return numbers.astype(kind)
-    limits = np.iinfo(f"{kind[0]}{min(int(kind[1]), 4)}")  # beyond that, doubles are not exact
-    fits = (numbers >= limits.min) & (numbers <= limits.max) & (np.floor(numbers) == numbers)
-    return np.where(fits, numbers, -1 if kind[0] == "i" else limits.max).astype(kind)
-
-
-class _Bytes:
-    of_counts = ""
-
-    def __init__(self, content: bytes, place: int, order: str) -> None:
-        self.content, self.place, self.order = content, place, order
-
-    @property
-    def left(self) -> int:
-        return 0  # what follows belongs to nobody, and is passed over
-
-    def take(self, kind: str, count: int) -> Array:
-        size = count * int(kind[1])
-        if not 0 <= size <= len(self.content) - self.place:
-            raise ValueError("it ends within a face")
-        self.place += size
-        if not size:
-            return np.zeros(0, kind)
-        return np.frombuffer(self.content, self.order + kind, count, self.place - size)
-
-    def table(self, kinds: Sequence[tuple[str, int]], rows: int) -> list[Array] | None:
-        size = sum(int(kind[1]) * count for kind, count in kinds)
-        if rows * size > len(self.content) - self.place:
-            return None
-        row = np.dtype(
-            [(str(i), self.order + kind, (count,)) for i, (kind, count) in enumerate(kinds)]
-        )
-        found = np.frombuffer(self.content, row, rows, self.place) if rows else np.zeros(0, row)
-        self.place += rows * size
-        return [found[str(i)] for i in range(len(kinds))]
-
-    def back(self, place: int) -> None:
-        self.place = place
-
-
-def _numbers(header: Sequence[str], content: bytes, start: int) -> _Numbers:
-    said = next((line.split()[1:2] for line in header if line.split()[:1] == ["format"]), [])
-    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get("".join(said))
-    if order is not None:
-        return _Bytes(content, start, order)
-    if said != ["ascii"]:
-        raise ValueError(f"its format is {''.join(said)[:40]!r}")
-    return _Text(content[start:])
-
-
-def _element(
-    numbers: _Numbers, name: str, count: int, properties: Sequence[Sequence[str]]
-) -> dict[str, _Column]:
-    """All rows of an element; of lists that are all as long as the first as one table."""
-    start = numbers.place
-    lengths = [lists[0] for lists in _one_by_one(numbers, min(count, 1), properties)[0]]
-    numbers.back(start)
-    kinds: list[tuple[str, int]] = []
-    for words, length in zip(properties, lengths or [0] * len(properties), strict=True):
-        if words[0] == "list":
-            kinds.append((numbers.of_counts or _KINDS[words[1]], 1))
-        kinds.append((_KINDS[words[-2]], length if words[0] == "list" else 1))
-    if not kinds:
-        return {}
-    found: dict[str, _Column] = {}
-    if (table := numbers.table(kinds, count)) is not None:
-        parts = iter(table)
-        for words, length in zip(properties, lengths or [0] * len(properties), strict=True):
-            if (is_list := words[0] == "list") and not (next(parts) == length).all():
-                break
-            flat = next(parts).reshape(-1)
-            counts = np.full(count, length if is_list else 1, np.int64)
-            found[words[-1]] = _Column(counts=counts, flat=flat, is_list=is_list)
-        else:
-            return found
-    if all(words[0] != "list" for words in properties):
-        raise ValueError(f"it ends before its {count} elements {name!r}")
-    numbers.back(start)
-    sizes, pieces = _one_by_one(numbers, count, properties)
-    return {
-        words[-1]: _Column(
-            counts=np.array(size, np.int64), flat=np.concatenate(piece), is_list=words[0] == "list"
-        )
-        for words, size, piece in zip(properties, sizes, pieces, strict=True)
-    }
-
-
-def _one_by_one(
-    numbers: _Numbers, count: int, properties: Sequence[Sequence[str]]
-) -> tuple[list[list[int]], list[list[Array]]]:
-    """Of each property how many numbers each row has, and these; nothing of no rows."""
-    sizes: list[list[int]] = [[] for _ in properties] if count else []
-    pieces: list[list[Array]] = [[] for _ in properties] if count else []
-    for _ in range(count):
-        for words, size, piece in zip(properties, sizes, pieces, strict=True):
-            length = 1
-            if words[0] == "list":
-                said = float(numbers.take(numbers.of_counts or _KINDS[words[1]], 1)[0])
-                if not said.is_integer() or said < 0:
-                    raise ValueError(f"a list has {said:g} elements")
-                length = int(said)
-            piece.append(numbers.take(_KINDS[words[-2]], length))
-            size.append(length)
-    return sizes, pieces
