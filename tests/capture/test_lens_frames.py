@@ -222,6 +222,17 @@ def test_a_pinhole_with_a_mask_is_the_photograph_where_it_is_white(tmp_path):
     np.testing.assert_array_equal(image[~hidden], expected[~hidden])
 
 
+@pytest.mark.parametrize("mask", ["", " ", 3])
+def test_a_mask_path_that_is_none_is_told_by_file_and_frame(tmp_path, mask):
+    made = make_capture(tmp_path / "room")
+    with edited(made.manifest) as document:
+        name, document["frames"][2]["mask_path"] = document["frames"][2]["file_path"], mask
+    said = "is not a file name" if mask == 3 else "is empty"
+    said = rf"transforms\.json: the mask_path of the frame '{name}' {said}\. .*\[capture\.mask\]$"
+    with pytest.raises(InputRefused, match=said):
+        read_scan(made.folder, IngestOptions())
+
+
 def test_masks_that_cannot_be_are_dropped_with_words(tmp_path):
     made = make_capture(tmp_path / "room")
     write_preview_png(made.folder / "small.png", np.zeros((5, 32, 3), np.uint8))

@@ -19,6 +19,7 @@ from usdbrdf.files import images
 from usdbrdf.files.images import (
     encoded_jpeg,
     image_size,
+    kind_of_colours,
     read_exr,
     read_radiance,
     write_exr,
@@ -254,6 +255,8 @@ def _layer(name, letters="RGBA"):
         (("beauty.blue", "beauty.green", "beauty.red", "depth.Z"), [2, 1, 0]),
         ((*_layer("albedo", "RGB"), *_layer("RGBA", "rgb")), [3, 4, 5]),
         ((*_layer("beauty"), "R", "G", "B"), [4, 5, 6]),
+        ((*_layer("normal", "RGB"), *_layer("color", "RGB"), *_layer("CryptoObject00")), [3, 4, 5]),
+        ((*_layer("P", "RGB"), *_layer("camera1")), [3, 4, 5, 6]),
     ],
 )  # fmt: skip
 def test_of_layers_that_of_the_whole_picture_is_read(tmp_path, names, chosen):
@@ -268,6 +271,9 @@ def test_of_layers_that_of_the_whole_picture_is_read(tmp_path, names, chosen):
     [
         (*_layer("diffuse", "RGB"), *_layer("specular", "RGB")),
         (*_layer("Left.Combined", "RGB"), *_layer("Right.Combined", "RGB")),
+        (*_layer("cam1", "RGB"), *_layer("cam2", "RGB")),
+        (*_layer("normal", "RGB"), *_layer("wetness", "RGB")),
+        (*_layer("image", "RGB"), *_layer("wetness", "RGB")),
     ],
 )
 def test_layers_of_which_none_is_the_whole_picture_are_listed(tmp_path, names):
@@ -301,6 +307,19 @@ def test_layers_may_be_parts_of_the_file(tmp_path, radiance):
     _two_parts(path, radiance, radiance + 1, (names[0], _layer("gloss", "RGB")))
     with pytest.raises(ImageRefused, match=r"2 layers have R, G and B \('diffuse', 'gloss'\)"):
         read_radiance(path)
+
+
+@pytest.mark.fault("I8")
+def test_a_part_that_is_called_as_no_picture_is_none_whatever_its_channels(tmp_path, radiance):
+    path, letters = tmp_path / "a.exr", ("R", "G", "B")
+    for other in ("rgba", "camera1"):
+        _two_parts(path, radiance + 1, radiance, (letters, letters), ("normal", other))
+        assert np.array_equal(read_radiance(path), radiance.astype(np.float16))
+        assert kind_of_colours(path) == 2
+    _two_parts(path, radiance, radiance, (letters, letters), ("normal", "albedo"))
+    with pytest.raises(ImageRefused, match=r"2 layers have R, G and B \('normal', 'albedo'\)"):
+        read_radiance(path)
+    assert kind_of_colours(path) == 0
 
 
 @pytest.mark.fault("I9")
@@ -353,14 +372,14 @@ def test_exr_truncated_anywhere(tmp_path, radiance, compression, length):
         read_radiance(path)
 
 
-def _two_parts(path, first, second, names):
+def _two_parts(path, first, second, names, parts=("part 0", "part 1")):
     """A multi-part EXR: each part one picture with channels of these names."""
     specs = []
     for pixels, channels in zip((first, second), names, strict=True):
         spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "half")
         spec.channelnames = channels
         spec.attribute("compression", "zip")
-        spec.attribute("oiio:subimagename", f"part {len(specs)}")
+        spec.attribute("oiio:subimagename", parts[len(specs)])
         specs.append(spec)
     output = oiio.ImageOutput.create(str(path))
     assert output.open(str(path), tuple(specs))

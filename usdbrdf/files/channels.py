@@ -22,6 +22,11 @@ _OTHERWISE = re.compile(
     "|^(ao|coat|direct|env|flow|gi|height|ids?|lighting|matte|mist|mv|n|ng|nn|p|pn|pos|pref|spec|sss|"
     "st|uvw?s?|volume(dir|ind|direct|indirect)?|z)$"
 )
+# And what a picture is called beside such.
+_PICTURE = re.compile(
+    "^(cam|camera|colou?r|default|final|frame|hdr|image|img|main|master|photo|picture|radiance"
+    "|render|rgb)$"
+)
 _LETTERS = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
 
 
@@ -40,8 +45,8 @@ def colours_of(source: Any) -> dict[str, int] | list[str]:
     the part with it; else the layers of which each might be.
 
     R, G and B come first; then the only layer that is called as renderers call their whole picture,
-    or the only one, unless it is called as something that is none. RuntimeError where the parts
-    cannot be read.
+    or the only one, unless it is called as something that is none; or of several the only one that
+    is not, if it is called as a picture. RuntimeError where the parts cannot be read.
     """
     found: list[tuple[int, str, dict[str, int]]] = []
     part = 0
@@ -52,11 +57,17 @@ def colours_of(source: Any) -> dict[str, int] | list[str]:
             break
         layers = layers_with_colours(source.spec().channelnames)
         if "" in layers:
-            return layers[""]
+            name = str(source.spec().getattribute("oiio:subimagename") or "")
+            if not _shows_otherwise(name):
+                return layers[""]
+            layers[name] = layers.pop("")
         found += [(part, layer, channels) for layer, channels in layers.items()]
     beauty = [one for one in found if one[1].lower().rpartition(".")[2] in _BEAUTY]
-    alone = [] if any(_shows_otherwise(layer) for _, layer, _ in found) else found
-    chosen = next((some[0] for some in (beauty, alone) if len(some) == 1), None)
+    left = [one for one in found if not _shows_otherwise(one[1])]
+    # Beside passes it must be called as a picture: there are more of these than names known here.
+    alone = left if len(found) == 1 else [one for one in left if _PICTURE.search(_word(one[1]))]
+    sure = alone if len(alone) == len(left) else []
+    chosen = next((some[0] for some in (beauty, sure) if len(some) == 1), None)
     if part:
         source.geterror()  # that there is no such part
         if not source.seek_subimage(chosen[0] if chosen else 0, 0):
@@ -66,4 +77,9 @@ def colours_of(source: Any) -> dict[str, int] | list[str]:
 
 def _shows_otherwise(layer: str) -> bool:
     """Whether a layer is called as a pass that is no picture, as normals or an object's numbers."""
-    return bool(_OTHERWISE.search(re.sub(r"[\W\d_]", "", layer.lower().rpartition(".")[2])))
+    return bool(_OTHERWISE.search(_word(layer)))
+
+
+def _word(layer: str) -> str:
+    """The letters of a layer's last name."""
+    return re.sub(r"[\W\d_]", "", layer.lower().rpartition(".")[2])

@@ -146,7 +146,7 @@ def kind_of_colours(path: Path) -> int:
     source = open_image(path)
     with _decoding(path, source, "not a readable image", "image.unreadable"):
         known = isinstance(colours_of(source), dict)
-    return known + ("" in layers_with_colours(source.spec().channelnames))
+    return int(known) and 1 + ("" in layers_with_colours(source.spec().channelnames))
 
 
 def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:

@@ -421,9 +421,12 @@ def _mask(capture: _Capture, frame: Mapping[str, Any], name: str) -> Path | None
     mask = frame.get("mask_path")
     if mask is None or not capture.images:
         return None
-    if not isinstance(mask, str):
+    if not isinstance(mask, str) or not mask.strip():
+        said = "is empty" if isinstance(mask, str) else "is not a file name"
         raise capture.refuse(
-            f"the mask_path of the frame {name!r} is not a file name. Correct it.", "capture.mask"
+            f"the mask_path of the frame {name!r} {said}. Name its mask, or remove the key where "
+            "it has none.",
+            "capture.mask",
         )
     return path_in_capture(capture.source.parent, mask, capture.options)
 
