@@ -28,6 +28,10 @@ DOCUMENTS = [
     ("scene0000_00.sens", "\x04", "ScanNet", "reader.py (--export_color_images --export_poses"),
     ("groundtruth.txt", "# ground truth trajectory\n", "TUM RGB-D", "a transforms.json"),
     ("run.txt", "#\n# timestamp tx ty tz qx qy qz qw\n", "TUM RGB-D", "fuse the depths"),
+    ("frame-000000.pose.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "7-Scenes", "fuse the"),
+    ("lowres_wide.traj", "1.5 0.1 0.2 0.3 0 0 0\n", "ARKitScenes", "a transforms.json"),
+    ("41254.1_2.pincam", "256 192 211 211 128 96\n", "ARKitScenes", "a transforms.json"),
+    ("house.conf", "dataset matterport\nn_images 90\n", "Matterport3D", "the scene's mesh"),
     ("cameras.json", '[{"id": 0, "img_name": "1"}]', "Gaussian splatting", "trained on"),
     ("meta_data.json", '{"frames": [{"camtoworld": []}]}', "SDFStudio", "COLMAP"),
     ("cameras_sphere.npz", "PK\x03\x04", "NeuS", "COLMAP"),
@@ -58,6 +62,14 @@ def test_cameras_of_other_programs_are_named_with_their_way_in(
         said = _refused(path)
         assert f"{name} holds the cameras of {program}, which are not read." in said
         assert how in said
+
+
+def test_of_several_stages_one_is_to_be_named(tmp_path):
+    for name in ("geo.usda", "scene.usdc"):
+        (tmp_path / name).write_text("#usda 1.0\n")
+    (tmp_path / "0001.exr").write_bytes(b"")
+    said = "it holds 2 USD files, first geo.usda. Name the one that has cameras and meshes"
+    assert said in _refused(tmp_path)
 
 
 def test_a_document_that_names_no_program_is_none_of_theirs(tmp_path):

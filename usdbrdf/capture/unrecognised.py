@@ -10,6 +10,7 @@ from typing import NamedTuple
 # As in ``named_pictures`` and ``mesh_files``, which load NumPy; a glance needs names alone.
 _PICTURES = frozenset((".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg"))
 _MESHES = frozenset((".ply", ".obj", ".glb", ".gltf", ".stl", ".fbx"))
+_STAGES = frozenset((".usd", ".usda", ".usdc", ".usdz"))
 _OF_COLMAP = frozenset(
     f"{part}.{kind}" for part in ("cameras", "images", "points3D") for kind in ("bin", "txt")
 )
@@ -32,13 +33,14 @@ class _Program(NamedTuple):
     only: str = ""
 
     def owns(self, document: Path, head: bytes) -> bool:
-        name, suffix = document.name.lower(), document.suffix.lower()
-        if suffix in self.suffixes or (suffix == ".json" and name.startswith(self.names)):
+        name = document.name.lower()
+        if name.endswith(self.suffixes) or (name.endswith(".json") and name.startswith(self.names)):
             return True
         return self.only in ("", name) and re.search(self.says, head) is not None
 
 
 _ANEW = "Reconstruct the same photographs with COLMAP, and name its folder"
+_BY_HAND = "Write a transforms.json of the pictures' poses and lens"
 _EXAMPLE = "the example of an adapter, plugins/example_adapter of our sources"
 _NOTHING = rb"(?!)"
 _PROGRAMS = (
@@ -88,8 +90,19 @@ _PROGRAMS = (
     ),
     _Program(
         "TUM RGB-D", (), (), rb"(?m)\A# ground truth trajectory|^# *timestamp +tx +ty +tz +qx",
-        "Write a transforms.json of the pictures' poses and lens, and fuse the depths into a mesh "
-        "(Open3D)",
+        f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+    ),
+    _Program(
+        "7-Scenes", (".pose.txt",), (), _NOTHING,
+        f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+    ),
+    _Program(
+        "ARKitScenes", (".traj", ".pincam"), (), _NOTHING,
+        f"{_BY_HAND}, and name the scene's mesh in it",
+    ),
+    _Program(
+        "Matterport3D", (), (), rb"(?m)^dataset matterport",
+        f"{_BY_HAND}, and name the scene's mesh in it",
     ),
     _Program(
         "Gaussian splatting", (), (), rb'"img_name"',
@@ -137,6 +150,12 @@ def what_lies_there(path: Path) -> str:
     for file in files:
         if file.suffix.lower() not in _PICTURES | _MESHES and (said := other_program(file)):
             return said
+    stages = [file for file in files if file.suffix.lower() in _STAGES and file.parent == path]
+    if len(stages) > 1:
+        return (
+            f"it holds {len(stages)} USD files, first {stages[0].name}. Name the one that has "
+            "cameras and meshes"
+        )
     pictures = sum(file.suffix.lower() in _PICTURES for file in files)
     meshes = [file for file in files if file.suffix.lower() in _MESHES]
     held = f"{pictures} picture{'s' * (pictures != 1)}" if pictures else ""
