@@ -47,6 +47,22 @@ def test_the_document_itself_can_be_named(capture):
     assert len(read_scan(capture.manifest, IngestOptions()).frames) == 12
 
 
+@pytest.mark.parametrize("angle", [45, 80])
+def test_an_angle_in_degrees_is_no_other_angle(tmp_path, angle):
+    """45 in radians has the tangent of an angle that a lens may have."""
+    made = make_capture(tmp_path / "room")
+    with edited(made.manifest) as document:
+        for holder in (document, *document["frames"]):
+            holder.pop("fl_x", None)
+            holder.pop("fl_y", None)
+        document["camera_angle_x"] = angle
+    said = (
+        rf"transforms\.json: camera_angle_x is {angle}, but it is in radians.*\[capture\.camera\]$"
+    )
+    with pytest.raises(InputRefused, match=said):
+        read_scan(made.folder, IngestOptions())
+
+
 def test_intrinsics_from_the_angle_and_from_the_image_header(capture):
     with edited(capture.manifest) as document:
         for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):

@@ -305,19 +305,29 @@ def _intrinsics(
 ) -> tuple[float, float, float, float]:
     if lens.curve == "equirectangular":
         return whole_sphere(width, height)
-    fx, fy = capture.positive(frame, "fl_x"), capture.positive(frame, "fl_y")
-    if fx is None and (across := capture.positive(frame, "camera_angle_x")) is not None:
-        fx = width / (2 * math.tan(across / 2))
-    if fy is None and (up := capture.positive(frame, "camera_angle_y")) is not None:
-        fy = height / (2 * math.tan(up / 2))
-    if fx is None or not fx > 0:
+    fx = capture.positive(frame, "fl_x") or _of_angle(capture, frame, "camera_angle_x", width)
+    fy = capture.positive(frame, "fl_y") or _of_angle(capture, frame, "camera_angle_y", height)
+    if fx is None:
         raise capture.refuse(
-            f"the frame {name!r} has neither fl_x nor a camera_angle_x below 180 degrees. State "
-            "the focal length in pixels.",
+            f"the frame {name!r} has neither fl_x nor camera_angle_x. State the focal length in "
+            "pixels.",
             "capture.camera",
         )
     cx, cy = capture.number(frame, "cx"), capture.number(frame, "cy")
     return fx, fy or fx, width / 2 if cx is None else cx, height / 2 if cy is None else cy
+
+
+def _of_angle(capture: _Capture, frame: Mapping[str, Any], key: str, size: float) -> float | None:
+    """The focal length in pixels of an image that is as wide as an angle, None without one."""
+    angle = capture.positive(frame, key)
+    if angle is not None and angle >= math.pi:
+        # Its tangent may be that of another angle altogether.
+        raise capture.refuse(
+            f"{key} is {angle:g}, but it is in radians, below {math.pi:.4g}. Correct it, or state "
+            "the focal length in pixels.",
+            "capture.camera",
+        )
+    return None if angle is None else size / (2 * math.tan(angle / 2))
 
 
 def _why_of_another_size(
