@@ -163,7 +163,9 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
         "views": [view.told(pictures) for view in shown],
         "plot": models_only(rows),
         "maps": _maps(atlas, seen, known, _overviews(views.frames)),
-        "room": room_model(place, atlas, seen.lit.rays, frames.camera(widest), up_axis),
+        "room": room_model(
+            place, atlas, seen.lit, frames.camera(widest), up_axis, options.environment
+        ),
         "advice": None if advice is None else {"poses": advice[0], "current": advice[1]},
         **reviewed(place),
     }
