@@ -11,7 +11,7 @@ import numpy as np
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.delivery.package import package
+from usdbrdf.delivery.package import write_package
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import resized
@@ -57,7 +57,8 @@ def room_model(
         with scratch_folder() as folder:
             file = folder / "room.glb"
             options = PackageOptions(max_size=_TEXTURE, lighting=asset.lighting or None)
-            package(asset.folder, file, options)
+            # Its lights are told apart from it, and glTF is not what is handed over here.
+            write_package(asset.folder, file, options, lambda _: None)
             content = file.read_bytes()
     except UsdBrdfError as error:
         say(f"report: without the room in 3D: {error}")
