@@ -6,6 +6,7 @@ import base64
 import gzip
 import json
 import re
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -308,6 +309,27 @@ def test_daylight_is_told_with_what_it_brings_and_how_sure_that_is(room):
         daylight(atlas, replace(dark, environment=light.under(NO_SUN)), "none", "Z", 1.0)["sun"]
         is None
     )
+
+
+def test_an_object_without_a_name_is_called_by_its_identifier(room):
+    _, atlas = measured_atlas(room.asset)
+    objects_ = [replace(obj, label="  ") for obj in atlas.scene.objects]
+    unnamed = SimpleNamespace(
+        texels=atlas.texels, emission=atlas.emission, scene=SimpleNamespace(objects=objects_)
+    )
+    found = lamps(unnamed, "Z")
+    assert found
+    assert {lamp["label"] for lamp in found} <= {obj.identifier for obj in objects_}
+
+
+def test_a_copy_without_its_photographs_is_told_what_it_lacks(room, tmp_path):
+    copy = tmp_path / "elsewhere" / "deeper" / "room"
+    shutil.copytree(room.asset, copy)
+    with pytest.raises(
+        InputRefused, match=r"room: (\d+) of its \1 photographs are not there"
+    ) as no:
+        report(copy, tmp_path / "page.html")
+    assert "[report.photographs]" in str(no.value)
 
 
 def test_texels_that_mirror_daylight_are_no_lamp(room):
