@@ -89,6 +89,9 @@
       el('figcaption', {}, `From above, cut at the cameras\u2019 height: ${map.metres.map(metres).join(' \u00d7 ')}. Dots: cameras; lines: where they look.${map.advised.length ? ' Numbers: photographs that are advised.' : ''}`));
   }
 
+  /* What a terminal is told in ASCII, in the signs that it stands for; nothing breaks inside. */
+  const signs = (text) => text.replaceAll('+-', '\u00b1').replaceAll(' -> ', ' \u2192\u00a0').replaceAll('m^2', 'm\u00b2');
+
   function advice() {
     const { advice: found } = data;
     if (!found) {
@@ -100,7 +103,7 @@
     }
     $('advised').append(
       el('p', { class: 'soft' }, 'The most telling first, each with what it adds to those before it. Numbers as on the map.'),
-      el('ol', {}, ...found.poses.map((pose) => el('li', {}, el('strong', {}, pose.where), ' ', pose.reason))));
+      el('ol', {}, ...found.poses.map((pose) => el('li', {}, el('strong', {}, signs(pose.where)), ' ', signs(pose.reason)))));
   }
 
   function frameChart(title, unit, value, logarithmic) {
