@@ -261,6 +261,17 @@ def test_a_locale_that_spells_names_otherwise_than_usd(tmp_path):
     assert "set LC_ALL=C.UTF-8" in done.stderr
 
 
+def test_sentences_end_once_and_tell_nothing_of_usds_own_source(tmp_path, capsys):
+    code, line = refused(capsys, "convert", "scan", "-o", "room", "--texel-sizes", "1")
+    assert code == 2
+    assert "Did you mean --texel-size? See usdbrdf convert --help." in line
+    (tmp_path / "scan.usda").write_text("no layer\n")
+    code, line = refused(capsys, "convert", str(tmp_path / "scan.usda"), "-o", str(tmp_path / "o"))
+    assert code == 3
+    assert "is not a valid usda layer). Export it again." in line
+    assert "pxrInternal" not in line
+
+
 def test_missing_scan(tmp_path, capsys):
     status, line = refused(capsys, "convert", tmp_path / "none", "-o", tmp_path / "a" / "b")
     assert status == 3

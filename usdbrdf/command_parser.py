@@ -64,7 +64,8 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
             given = app.parse_args(words, exit_on_error=False, print_error=False)[1].arguments
         except CycloptsError as error:
             found = " ".join(str(error).split()).rstrip(".")
-            raise UsageError(f"{found}. See usdbrdf {name} --help. [usage.option]") from error
+            sentence = found if found.endswith("?") else f"{found}."
+            raise UsageError(f"{sentence} See usdbrdf {name} --help. [usage.option]") from error
     command: Command = _made(commands[name], given)
     return command
 

@@ -1,7 +1,8 @@
-// The room in three dimensions, for the page of usdbrdf: orbit, looks, lamps, picking. Bundled with
+// The room in three dimensions, for the page of usdbrdf: orbit, looks, lamps, daylight, picking. Bundled with
 // three.js by build.mjs; the page calls usdbrdfRoom.start.
 import {
-  AmbientLight, Box3, Color, ColorManagement, DoubleSide, LinearToneMapping, MeshBasicMaterial,
+  AmbientLight, Box3, Color, ColorManagement, DirectionalLight, DoubleSide,
+  EquirectangularReflectionMapping, LinearToneMapping, MeshBasicMaterial, PCFShadowMap,
   PerspectiveCamera, PointLight, Raycaster, SRGBColorSpace, Scene, TextureLoader, Vector2, Vector3,
   WebGLRenderer,
 } from 'three';
@@ -10,8 +11,12 @@ import { GLTFLoader } from 'three/examples/jsm/loaders/GLTFLoader.js';
 
 ColorManagement.enabled = true;
 // Of the light that surfaces send on to each other, which is not traced here, so much is left when
-// all lamps are on, as a share of the irradiance that was measured.
+// lamps and sun are on, as a share of the irradiance that was measured. That of the sky, which comes
+// from many sides, is all of this kind.
 const INDIRECT = 0.5;
+const NIGHT = 0x0b0d10;
+// Pixels across the map of the sun's shadows.
+const SHADOWS = 4096;
 
 async function unpacked(text) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
@@ -26,18 +31,26 @@ export async function start(canvas, room, colours, pick) {
   renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
   renderer.toneMapping = LinearToneMapping;
   const scene = new Scene();
-  scene.background = new Color(0x0b0d10);
+  const night = scene.background = new Color(NIGHT);
   const { scene: model } = await new GLTFLoader().parseAsync(await unpacked(room.glb), '');
   scene.add(model);
-  const meshes = [];
+  const meshes = [], others = [];
   model.traverse((node) => {
+    // Lights of the file's own, which are told again below, with what can be switched.
+    if (node.isLight) others.push(node);
     if (!node.isMesh) return;
     let owner = node;
     while (owner && !(owner.userData && owner.userData.usdPrim)) owner = owner.parent;
     node.userData.prim = owner ? owner.userData.usdPrim : node.name;
     node.userData.shaded = node.material;
+    // What is clear lets the sun pass; of walls either side stops it.
+    node.castShadow = !(node.material.transmission > 0);
+    node.receiveShadow = true;
+    node.material.shadowSide = DoubleSide;
     meshes.push(node);
   });
+
+  for (const node of others) node.removeFromParent();
 
   const box = new Box3().setFromObject(model);
   const size = box.getSize(new Vector3());
@@ -73,20 +86,64 @@ export async function start(canvas, room, colours, pick) {
   scene.add(moved);
   const ambient = new AmbientLight(0xffffff, 1);
   scene.add(ambient);
-  const total = room.lamps.reduce((sum, lamp) => sum + Math.max(...lamp.intensity), 0);
+  const { sky = null, sun = null } = room.outside || {};
+  const on = { sky: true, sun: true };
+  let behind = null;
+  if (sky) {
+    behind = await new TextureLoader().loadAsync(sky.picture);
+    behind.mapping = EquirectangularReflectionMapping;
+    behind.colorSpace = SRGBColorSpace;
+  }
+  let sunlight = null;
+  if (sun) {
+    const most = Math.max(...sun.irradiance);
+    sunlight = new DirectionalLight(new Color(), most);
+    sunlight.color.setRGB(...sun.irradiance.map((value) => value / most));
+    const centre = box.getCenter(new Vector3());
+    sunlight.target.position.copy(centre);
+    sunlight.position.copy(centre).addScaledVector(new Vector3(...sun.direction), reach);
+    sunlight.castShadow = true;
+    const { shadow } = sunlight;
+    const side = Math.min(SHADOWS, renderer.capabilities.maxTextureSize);
+    shadow.mapSize.set(side, side);
+    const half = reach / 2;
+    Object.assign(shadow.camera, {
+      left: -half, right: half, top: half, bottom: -half, near: reach / 4, far: 2 * reach,
+    });
+    // Of a pixel of the map, so that no surface shades itself, and little light leaks at edges.
+    shadow.normalBias = 0.5 * reach / side;
+    shadow.bias = -5e-4;
+    scene.add(sunlight, sunlight.target);
+    renderer.shadowMap.enabled = true;
+    renderer.shadowMap.type = PCFShadowMap;
+    // Nothing moves in the room: they are drawn once.
+    shadow.autoUpdate = false;
+    shadow.needsUpdate = true;
+  }
+  // Of each source what it brings to the surfaces directly, the mean over them.
+  const spread = 4 * Math.PI / Math.max(room.area, 1e-12);
+  const direct = (source) => (source ? Math.max(...source.direct) : 0);
+  const total = room.lamps.reduce((sum, lamp) => sum + spread * Math.max(...lamp.intensity), 0)
+    + direct(sky) + direct(sun);
   const irradiance = Math.max(...room.irradiance, 1e-12);
   let extra = 0;
+  let look = 'shaded';
 
   function light() {
-    let lit = 0;
+    let lit = spread * extra;
     for (const lamp of lamps) {
       lamp.intensity = lamp.userData.on ? lamp.userData.full : 0;
-      lit += lamp.intensity;
+      lit += spread * lamp.intensity;
     }
     moved.intensity = extra;
-    const share = total > 0 ? (lit + extra) / total : 1;
+    if (sunlight) {
+      sunlight.visible = on.sun;
+      lit += on.sun ? direct(sun) : 0;
+    }
+    const even = INDIRECT * lit + (on.sky ? direct(sky) : 0);
     ambient.color.setRGB(...room.irradiance.map((value) => value / irradiance));
-    ambient.intensity = (total > 0 ? INDIRECT : 1) * irradiance * share;
+    ambient.intensity = irradiance * (total > 0 ? even / total : 1);
+    background();
     for (const mesh of meshes) {
       const lamp = lamps.find((one) => one.userData.prim === mesh.userData.prim);
       if (lamp && mesh.userData.shaded.emissive) {
@@ -96,6 +153,10 @@ export async function start(canvas, room, colours, pick) {
       }
     }
     draw();
+  }
+
+  function background() {
+    scene.background = behind && on.sky && look === 'shaded' ? behind : night;
   }
 
   const textures = {};
@@ -114,7 +175,6 @@ export async function start(canvas, room, colours, pick) {
     }
     return textures[prim];
   }
-  let look = 'shaded';
   function setLook(name) {
     look = name;
     for (const mesh of meshes) {
@@ -126,6 +186,7 @@ export async function start(canvas, room, colours, pick) {
       else mesh.material = plain(colours[name][prim] || [0.02, 0.02, 0.02]);
     }
     renderer.toneMappingExposure = room.exposure;
+    background();
     draw();
   }
 
@@ -188,13 +249,15 @@ export async function start(canvas, room, colours, pick) {
   light();
   return {
     setLook,
-    setLamp(index, on) { lamps[index].userData.on = on; light(); },
+    setLamp(index, shines) { lamps[index].userData.on = shines; light(); },
+    // name: 'sky' or 'sun'.
+    setOutside(name, shines) { on[name] = shines; light(); },
     // Of the movable light: shares of the room's box along x, y up, and z; strength as a share of
-    // all captured lamps together.
+    // all captured light together.
     moveLight(x, y, z, strength) {
       moved.position.set(
         box.min.x + x * size.x, box.min.y + y * size.y, box.min.z + z * size.z);
-      extra = strength * (total || irradiance * reach * reach * 0.05);
+      extra = strength * (total / spread || irradiance * reach * reach * 0.05);
       light();
     },
     home() { home(); draw(); },

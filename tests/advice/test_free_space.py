@@ -73,6 +73,21 @@ def test_around_an_object_as_far_away_as_the_cameras_were():
     assert np.isnan(found.height).sum() > 20  # there is no ground beside the ball
 
 
+def test_nobody_is_sent_onto_a_bed():
+    hall = trimesh.creation.box(bounds=[[0, 0, 0], [6, 6, 3]])
+    hall.invert()
+    bed = trimesh.creation.box(bounds=[[1.5, 1.5, 0], [4.5, 4.5, 0.6]])
+    both = trimesh.util.concatenate([hall, bed])
+    rays = RayScene(both.vertices.astype(np.float32), both.faces.astype(np.int32))
+    eyes = np.array([[0.7, 0.7, 1.5], [5.3, 0.7, 1.5], [0.7, 5.3, 1.6], [5.3, 5.3, 1.4]])
+    found = free_places(rays, eyes, 2, heights=(0.5, 2.0), clearance=CLEARANCE, count=200)
+    assert len(found.eye) > 100
+    assert found.eye[:, 2].max() <= 2.0
+    np.testing.assert_allclose(found.height, found.eye[:, 2], atol=1e-4)
+    inside = np.abs(found.eye[:, :2] - 3).max(axis=1)
+    assert inside.min() > 1.5 - 1.0
+
+
 def test_where_there_is_no_room_there_is_no_place(room, eyes):
     found = free_places(room[2], eyes, 2, heights=(0.5, 2.0), clearance=2.0, count=50)
     assert len(found.eye) == 0

@@ -137,6 +137,46 @@ def test_picking_tells_the_numbers_of_what_is_picked(opened, page_file):
     assert shown.faults == []
 
 
+def test_daylight_is_switched_on_and_off_and_named_for_what_it_is(opened, page_file, tmp_path):
+    data = data_of(page_file.read_text("utf-8"))
+    plain = opened(page_file.as_uri())
+    assert plain.get_by_role("group", name=re.compile("Daylight")).count() == 0
+    assert plain.locator("#look option").first.inner_text() == "lit by its lamps"
+    sun = {"direction": [0.0, 1.0, 0.0], "irradiance": [3, 2, 1], "direct": [0.3, 0.2, 0.1]}
+    sky = {"picture": data["views"][0]["full"], "direct": [0.2, 0.2, 0.4], "error": None}
+    data["room"]["outside"] = {"estimated": True, "sky": sky, "sun": {**sun, "error": 0.11}}
+    (tmp_path / "day.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "day.html").as_uri())
+    assert shown.locator("#look option").first.inner_text() == "lit by its lamps and daylight"
+    group, canvas = (
+        shown.get_by_role("group", name="Daylight, as estimated"),
+        shown.locator("canvas"),
+    )
+    assert group.get_by_role("checkbox").count() == 2
+    canvas.scroll_into_view_if_needed()
+
+    def picture():
+        shown.wait_for_timeout(500)
+        return canvas.screenshot()
+
+    pictures = [picture()]
+    for name in ("sun \u00b1 11 %", "sky"):
+        group.get_by_role("checkbox", name=name, exact=True).uncheck()
+        pictures.append(picture())
+    assert len(set(pictures)) == 3
+    assert shown.faults == []
+
+
+def test_advice_is_written_in_signs(opened, page_file, tmp_path):
+    data = data_of(page_file.read_text("utf-8"))
+    pose = {"where": "Stand there.", "reason": "psi +-0.29 -> +-0.22; 61 m^2 that no frame shows."}
+    data["advice"] = {"poses": [pose], "current": True}
+    (tmp_path / "advice.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "advice.html").as_uri())
+    told = shown.locator("#advised li").inner_text()
+    assert "psi \u00b10.29 \u2192\u00a0\u00b10.22; 61 m\u00b2" in told
+
+
 def test_without_webgl_there_are_pictures(opened, page_file):
     shown = opened(
         page_file.as_uri(), script="HTMLCanvasElement.prototype.getContext = () => null;"

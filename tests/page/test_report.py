@@ -6,6 +6,8 @@ import base64
 import gzip
 import json
 import re
+import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,9 +22,12 @@ from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView, measured_atlas
 from usdbrdf.model.material import turned_up
 from usdbrdf.page import objects, views
 from usdbrdf.page.capture import findings
+from usdbrdf.page.daylight import _around, daylight
 from usdbrdf.page.pictures import _BACKGROUND, Seen, SurfaceMap, part_around, pictures_of_map
 from usdbrdf.page.report import page, report, shows_most
 from usdbrdf.page.room import lamps, with_the_weakest_as_one
+from usdbrdf.transport.environment import NO_SUN, Environment, Sun, directions_of_pixels
+from usdbrdf.transport.rays import empty_hits
 
 
 def pictures(text):
@@ -263,3 +268,90 @@ def test_the_counts_of_all_objects_are_told_and_hundreds_of_lamps_in_one_sentenc
     assert alone[-1] == "The lamp bulb clipped everywhere: its radiance is an estimate."
     (one,) = (line for line in findings({"texture": {}, "shade": {}}, ["failed"], True)[1:])
     assert one == "The fit of 1 failed: its photographs do not determine the numbers."
+
+
+@pytest.mark.parametrize("up_axis", ["Y", "Z"])
+def test_the_sky_lies_around_the_room_as_the_viewer_looks_it_up(up_axis):
+    image = np.zeros((16, 32, 3), np.float32)
+    image[5, 11] = 1
+    looks = directions_of_pixels(16, 32, up_axis == "Z")[5, 11]
+    x, y, z = turned_up(up_axis, "Y")[:3, :3] @ looks
+    around = _around(Environment(image, up_axis == "Z"), turned_up(up_axis, "Y")[:3, :3])
+    height, width, _ = around.shape
+    row = (0.5 - np.arcsin(y) / np.pi) * height
+    column = (0.5 + np.arctan2(z, x) / (2 * np.pi)) * width
+    assert around[int(row), int(column)].tolist() == [1, 1, 1]
+    assert around[..., 0].mean() == pytest.approx(image[..., 0].mean())
+
+
+def test_daylight_is_told_with_what_it_brings_and_how_sure_that_is(room):
+    asset, atlas = measured_atlas(room.asset)
+    dark = viewed_asset(asset, atlas, "none").lit
+    assert daylight(atlas, dark, "none", "Z", 1.0) is None
+    sun = Sun(np.array([0.0, 0.6, 0.8]), np.array([3.0, 2.0, 1.0]))
+    light = Environment(np.full((4, 8, 3), 0.5, np.float32), True).under(sun)
+    nothing = SimpleNamespace(
+        closest=lambda origins, _: empty_hits(len(origins))._replace(
+            face=np.full(len(origins), -1, np.int32)
+        )
+    )
+    told = daylight(atlas, replace(dark, environment=light, rays=nothing), "none", "Z", 1.0)
+    assert not told["estimated"]
+    assert told["sky"]["error"] is told["sun"]["error"] is None
+    # Nothing is in the way here: the sky brings pi L, the sun its irradiance times the cosine.
+    assert told["sky"]["direct"] == pytest.approx([np.pi / 2] * 3, rel=1e-5)
+    assert told["sun"]["direction"] == pytest.approx(turned_up("Z", "Y")[:3, :3] @ sun.direction)
+    texels = atlas.texels
+    cosine = np.maximum(texels.normal @ sun.direction, 0)
+    mean = np.average(cosine, weights=np.where(texels.interior, texels.area, 0))
+    assert told["sun"]["direct"] == pytest.approx(mean * sun.irradiance, rel=0.05)
+    assert (
+        daylight(atlas, replace(dark, environment=light.under(NO_SUN)), "none", "Z", 1.0)["sun"]
+        is None
+    )
+
+
+def test_an_object_without_a_name_is_called_by_its_identifier(room):
+    _, atlas = measured_atlas(room.asset)
+    objects_ = [replace(obj, label="  ") for obj in atlas.scene.objects]
+    unnamed = SimpleNamespace(
+        texels=atlas.texels, emission=atlas.emission, scene=SimpleNamespace(objects=objects_)
+    )
+    found = lamps(unnamed, "Z")
+    assert found
+    assert {lamp["label"] for lamp in found} <= {obj.identifier for obj in objects_}
+
+
+def test_a_copy_without_its_photographs_is_told_what_it_lacks(room, tmp_path):
+    copy = tmp_path / "elsewhere" / "deeper" / "room"
+    shutil.copytree(room.asset, copy)
+    with pytest.raises(
+        InputRefused, match=r"room: (\d+) of its \1 photographs are not there"
+    ) as no:
+        report(copy, tmp_path / "page.html")
+    assert "[report.photographs]" in str(no.value)
+
+
+def test_texels_that_mirror_daylight_are_no_lamp(room):
+    _, atlas = measured_atlas(room.asset)
+    strength = max(sum(lamp["intensity"]) for lamp in lamps(atlas, "Z"))
+    assert lamps(atlas, "Z", 1e4 * strength) == []
+
+
+def test_the_findings_say_what_is_known_of_the_light_from_outside():
+    def told(**outside):
+        shade = {"escaped_fraction": 0.25, **outside}
+        return findings({"texture": {}, "shade": shade}, ["prior"], True)[-1]
+
+    begins = "25.0% of the directions in which surfaces look leave the scan."
+    assert told() == f"{begins} What is out there counts as dark."
+    found = {
+        "source": "estimated",
+        "sky_error": 0.52,
+        "sun_error": 0.11,
+        "sun_direction": [0, 0, 1],
+    }
+    estimated = "The light from there was estimated: sky to \u00b1 52%, sun to \u00b1 11%."
+    assert told(outside=found) == f"{begins} {estimated}"
+    given = {"source": "given", "sky_error": 0.0}
+    assert told(outside=given) == f"{begins} A file told the light from there: sky."

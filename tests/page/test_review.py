@@ -147,6 +147,12 @@ def test_a_run_tells_what_changed_and_what_was_asked_for(built):
     assert notes_for_run(asset)[1] == f"<{CHAIR}> was made as 'metal', as the directive asks."
 
 
+def test_a_run_tells_of_objects_that_are_gone(built):
+    write_review(built.asset, {"/room/geo/sofa/sofa": Judgement(directive="metal")})
+    gone = "</room/geo/sofa/sofa> is no object any more: what is said of it is passed over."
+    assert notes_for_run(built.asset) == [gone]
+
+
 @pytest.mark.parametrize(
     "content",
     [

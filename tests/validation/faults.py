@@ -79,6 +79,11 @@ def texture_deleted(built):
     (built.asset.folder / "textures" / "lamp.lit.exr").unlink()
 
 
+def texture_cut_off(built):
+    file = built.asset.folder / "textures" / "lamp.lit.exr"
+    file.write_bytes(file.read_bytes()[:-20])
+
+
 def photograph_deleted(built):
     built.scan.frames.image_paths[2].unlink()
 
@@ -245,6 +250,7 @@ FAULTS = {
     "AnchoredPath": texture_by_absolute_path,
     "PathOutside": texture_outside_the_asset,
     "MissingTexture": texture_deleted,
+    "UnreadableTexture": texture_cut_off,
     "MissingPhotograph": photograph_deleted,
     "OrphanTexture": texture_that_no_layer_names,
     "PublishedFile": published_picture_changed,

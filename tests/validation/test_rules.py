@@ -3,10 +3,12 @@
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from pxr import Sdf, Usd
 
 from tests.validation.faults import CHAIR, COLOUR_TEXTURE, FAULTS, SURFACE, Types, edited, opinion
+from usdbrdf.files.images import write_exr
 from usdbrdf.validation.rule import AssetStage, Severity
 from usdbrdf.validation.validate import RULES, own_findings, validate
 
@@ -160,7 +162,7 @@ def test_paths_in_layers_of_the_folder_that_are_referenced_count(built):
     spec = Sdf.CreatePrimInLayer(prop, "/prop")
     Sdf.AttributeSpec(spec, "sheet", Types.Asset).default = Sdf.AssetPath("../sheet.exr")
     prop.Save()
-    (built.asset.folder.parent / "sheet.exr").touch()
+    write_exr(built.asset.folder.parent / "sheet.exr", np.ones((2, 2, 3), np.float32))
     with edited(built.asset.edits_layer) as layer:
         prim = Sdf.CreatePrimInLayer(layer, "/room/prop")
         prim.referenceList.prependedItems = [Sdf.Reference("./prop.usda", "/prop")]

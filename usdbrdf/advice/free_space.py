@@ -24,6 +24,8 @@ _ENCLOSED = 2 / 3
 _DIRECTIONS, _EYES = 64, 32
 # How far beside the floor that a person stands on a camera can be held.
 _REACH_M = 0.75
+# Nobody stands on what is higher than a step above the floor around it: a bed, a large table.
+_STEP_M, _FURNITURE_M = 0.4, 2.5
 # Around an object: shares of the least and largest distance of the cameras to it.
 _NEARER, _FARTHER = 0.8, 1.2
 
@@ -86,10 +88,10 @@ def free_places(
     free = distance >= clearance * (1 + 1 / 6)
     usable = _reached(rays, nodes, free.reshape(shape), eyes, 2 * clearance + 2 * step)
     ground = _ground(rays, nodes, usable, up)
-    reach = [1 + 2 * round(_REACH_M / step)] * 3
-    reach[up] = 1
-    below = ndimage.minimum_filter(ground.reshape(shape), size=reach, mode="constant", cval=np.inf)
-    height = nodes[:, up] - below.ravel()
+    if in_room:
+        lowest = _lowest_around(ground, shape, up, _FURNITURE_M / step)
+        ground[ground > lowest + _STEP_M] = np.inf
+    height = nodes[:, up] - _lowest_around(ground, shape, up, _REACH_M / step)
     if in_room:
         usable &= (height >= heights[0]) & (height <= heights[1])
     else:
@@ -182,6 +184,14 @@ def _reached(rays: RayScene, nodes: Double, free: Bool, eyes: Double, farthest: 
     clear = (near <= farthest) & ((hits.face < 0) | (hits.distance > 1))
     known = np.unique(flat[index[which[clear]]])
     return np.asarray(np.isin(flat, known[known > 0]), np.bool_)
+
+
+def _lowest_around(ground: Double, shape: tuple[int, ...], up: int, steps: float) -> Double:
+    """(nodes,): the least of ``ground`` (nodes,) up to so many steps of the grid beside each."""
+    size = [1 + 2 * round(steps)] * 3
+    size[up] = 1
+    lowest = ndimage.minimum_filter(ground.reshape(shape), size=size, mode="constant", cval=np.inf)
+    return np.asarray(lowest.ravel(), np.float64)
 
 
 def _ground(rays: RayScene, nodes: Double, usable: Bool, up: int) -> Double:

@@ -214,9 +214,14 @@ def notes_for_run(asset: Asset) -> list[str]:
     """What a run that measured anew has to tell whoever judged before it, a sentence each."""
     said = _said(asset)
     found = [f"<{path}> {change}" for path, change in _changes(asset, said).items()]
-    if not any(one.directive for one in said.values()):
+    if not any(one.says_something for one in said.values()):
         return found
-    return found + [f"<{path}> {told}" for path, told in followed(open_measured(asset), said)]
+    stage = open_measured(asset)
+    found += [f"<{path}> {told}" for path, told in followed(stage, said)]
+    gone = [path for path in said if not stage.GetPrimAtPath(path)]
+    return found + [
+        f"<{path}> is no object any more: what is said of it is passed over." for path in gone
+    ]
 
 
 def followed(stage: Usd.Stage, said: Mapping[str, Judgement]) -> Iterator[tuple[str, str]]:

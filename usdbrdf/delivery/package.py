@@ -21,7 +21,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layers.interface import UNPUBLISHED
-from usdbrdf.asset.layers.lights_layer import EMISSIVE, LIGHTS
+from usdbrdf.asset.layers.lights_layer import DAYLIGHT, EMISSIVE, LIGHTS, USDLUX
 from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, named_files, open_edited, open_weaker
@@ -61,6 +61,7 @@ _PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.p
 # Properties and schemas that name files of the capture or of other looks.
 _LEFT_OUT = ("usdBrdf:aov:", *OF_PHOTOGRAPHS)
 _MAPPING = "usdBrdf:fit:mapping"
+_FROM_OUTSIDE = {"DistantLight", "DomeLight"}
 _LEFT_OUT_SCHEMAS = ("UsdBrdfAovAPI:", *SCHEMAS_OF_PHOTOGRAPHS)
 USDZ, GLB = ".usdz", ".glb"
 # A zip archive stores local times; one and the same, so that equal content is equal bytes.
@@ -111,7 +112,8 @@ def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Us
     absolute and have still to be replaced.
 
     with_lights  False where the package can hold none: then lamps glow by their material, also
-                 where the artist selected lights in their place
+                 where the artist selected lights in their place; light from outside stays, for
+                 the caller to tell of what it leaves out
     """
     # Instances become prims of their own, in the session layer: flattened, prototypes would lie
     # beside the default prim, and what is bound to an instance would be seen by nobody.
@@ -123,7 +125,7 @@ def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Us
         sets = [(prim.GetPath(), prim.GetVariantSet(LIGHTS).GetVariantNames()) for prim in prims]
         for path in (path for path, names in sets if EMISSIVE in names):
             if prim := stage.GetPrimAtPath(path):  # the choice above it may have taken it away
-                prim.GetVariantSet(LIGHTS).SetVariantSelection(EMISSIVE)
+                _let_lamps_glow(prim)
     layer = stage.Flatten(addSourceFileComment=False)
     flat = Usd.Stage.Open(layer)
     layer.documentation = ""
@@ -155,6 +157,20 @@ def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Us
             kept = [name for name in listed if not name.startswith(_LEFT_OUT_SCHEMAS)]
             prim.SetMetadata("apiSchemas", Sdf.TokenListOp.Create(prependedItems=kept))
     return flat
+
+
+def _let_lamps_glow(prim: Usd.Prim) -> None:
+    """Select of the set ``lights`` what has no light in the place of a lamp."""
+    choice, stage = prim.GetVariantSet(LIGHTS), prim.GetStage()
+    chosen = choice.GetVariantSelection()
+    if chosen == USDLUX and DAYLIGHT in choice.GetVariantNames():
+        choice.SetVariantSelection(DAYLIGHT)
+    elif chosen not in (EMISSIVE, DAYLIGHT):
+        before = {light.GetPath(): light.GetTypeName() for light in lights_of(stage)}
+        choice.SetVariantSelection(EMISSIVE)
+        gone = before.keys() - {light.GetPath() for light in lights_of(stage)}
+        if gone and {before[path] for path in gone} <= _FROM_OUTSIDE:
+            choice.SetVariantSelection(chosen)
 
 
 def lights_of(flat: Usd.Stage) -> list[Usd.Prim]:
@@ -242,7 +258,13 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
     Raises UsageError for options that exclude each other, and InputRefused where the asset names
     files outside of its folder.
     """
-    options = options or PackageOptions()
+    return write_package(folder, output, options or PackageOptions(), warn)
+
+
+def write_package(
+    folder: Path, output: Path, options: PackageOptions, warn: Callable[[str], None]
+) -> dict[str, Any]:
+    """``package`` for whoever reads the asset already; ``warn`` is told what is left out."""
     asset = Asset.made(folder).in_lighting(options.lighting)
     options = replace(options, textures=_texture_format(output, asset, options))
     if options.whole:
@@ -269,7 +291,7 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
             moved = [surface.moved(turn) for surface in surfaces]
             summary = write_glb(output, moved, options.max_size, warn)
         else:
-            count = _write_usdz(output, flat, asset, options, made)
+            count = _write_usdz(output, flat, asset, options, made, warn)
             summary = {"textures": count, "format": options.textures, "profile": options.profile}
         size = output.stat().st_size
     return {"output": str(output), "look": look_of(stage), "bytes": size, **summary, **reduced}
@@ -309,7 +331,12 @@ def _refuse_unpacked(file: Path) -> None:
 
 
 def _write_usdz(
-    output: Path, flat: Usd.Stage, asset: Asset, options: PackageOptions, made: Path
+    output: Path,
+    flat: Usd.Stage,
+    asset: Asset,
+    options: PackageOptions,
+    made: Path,
+    warn: Callable[[str], None],
 ) -> int:
     """Returns the number of textures; ``made`` holds those that the asset has not."""
     if options.profile == ARKIT:

@@ -164,11 +164,25 @@ def findings(
     if "standard_error" in shade:
         told.append(f"The traced light has a standard error of {shade['standard_error']:.1%}.")
     if (escaped := shade.get("escaped_fraction", 0)) > 0.001:
-        told.append(f"{escaped:.1%} of the light's directions leave the scan.")
+        told.append(
+            f"{escaped:.1%} of the directions in which surfaces look leave the scan. "
+            f"{_outside(shade.get('outside'))}"
+        )
     told += _clipped_lamps(list(shade.get("estimated_emitters", {})))
     if not radiometric:
         told.append("The images are not radiometric: albedo and fit have no absolute meaning.")
     return told
+
+
+def _outside(found: Mapping[str, Any] | None) -> str:
+    if found is None:
+        return "What is out there counts as dark."
+    names = ["sky", *(["sun"] if "sun_direction" in found else [])]
+    if found.get("source") != "estimated":
+        return f"A file told the light from there: {' and '.join(names)}."
+    errors = {name: found.get(f"{name}_error") for name in names}
+    told = [name if not e else f"{name} to \u00b1 {e:.0%}" for name, e in errors.items()]
+    return f"The light from there was estimated: {', '.join(told)}."
 
 
 def _clipped_lamps(names: Sequence[str]) -> list[str]:

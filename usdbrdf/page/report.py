@@ -22,7 +22,7 @@ from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.asset.readers.views import Views, photographs_of_views
 from usdbrdf.asset.review import changes_since, read_review
 from usdbrdf.capture.checks import spread_evenly
-from usdbrdf.errors import OwnershipConflict, UsageError
+from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
 from usdbrdf.files.atomic import environment_failures, write_text_atomic
 from usdbrdf.files.scratch import scratch_folder
@@ -109,6 +109,7 @@ def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
 
 def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     place, atlas = measured_atlas(asset.folder, options.lighting)
+    _refuse_without_photographs(place, atlas.frames)
     # Where none is asked for it is the one that the asset opens in.
     place = place.in_lighting(atlas.lighting or None)
     up_axis = read_header(place.layer("scan")).up_axis
@@ -163,10 +164,22 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
         "views": [view.told(pictures) for view in shown],
         "plot": models_only(rows),
         "maps": _maps(atlas, seen, known, _overviews(views.frames)),
-        "room": room_model(place, atlas, seen.lit.rays, frames.camera(widest), up_axis),
+        "room": room_model(
+            place, atlas, seen.lit, frames.camera(widest), up_axis, options.environment
+        ),
         "advice": None if advice is None else {"poses": advice[0], "current": advice[1]},
         **reviewed(place),
     }
+
+
+def _refuse_without_photographs(asset: Asset, frames: Frames) -> None:
+    gone = [path for path in frames.image_paths if not path.is_file()]
+    if gone:
+        raise InputRefused(
+            f"{asset.folder}: {len(gone)} of its {len(frames)} photographs are not there, such as "
+            f"{gone[0]}, and the page is made from them. Make it of the asset beside its capture, "
+            "or of a version that was published with them. [report.photographs]"
+        )
 
 
 def reviewed(asset: Asset) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.delivery.package import package
+from usdbrdf.delivery.package import write_package
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import resized
@@ -19,8 +19,10 @@ from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.progress import say
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.material import turned_up
-from usdbrdf.options import PackageOptions
+from usdbrdf.options import PackageOptions, Surroundings
+from usdbrdf.page.daylight import area_of, daylight
 from usdbrdf.page.pictures import data_uri
+from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.rays import RayScene
 
 # Pixels of a texture's longer side.
@@ -34,7 +36,12 @@ _LOOKED_AT = 96
 
 
 def room_model(
-    asset: Asset, atlas: AssetMaps, rays: RayScene, camera: Camera, up_axis: str
+    asset: Asset,
+    atlas: AssetMaps,
+    lit: LitScene,
+    camera: Camera,
+    up_axis: str,
+    environment: Surroundings,
 ) -> dict[str, Any] | None:
     """What the page needs for its view in 3D; None, and a line that says why, where there is none.
 
@@ -43,25 +50,31 @@ def room_model(
     lit    by prim, the lit texture as a picture
     lamps  where those are that shine, y up, with their intensity as points, in the asset's units of
            radiance times m^2; the weakest of many are one
+    area   m^2 of the surfaces that their light is spread over
+    outside  see ``daylight``; the surroundings of ``lit`` are those of ``environment``
     """
     try:
         with scratch_folder() as folder:
             file = folder / "room.glb"
             options = PackageOptions(max_size=_TEXTURE, lighting=asset.lighting or None)
-            package(asset.folder, file, options)
+            # Its lights are told apart from it, and glTF is not what is handed over here.
+            write_package(asset.folder, file, options, lambda _: None)
             content = file.read_bytes()
     except UsdBrdfError as error:
         say(f"report: without the room in 3D: {error}")
         return None
     exposure = display_exposure(atlas.lit[atlas.coverage.measured].mean(axis=1))
+    area, outside = area_of(lit), daylight(atlas, lit, environment, up_axis, exposure)
     packed = gzip.compress(content, compresslevel=6, mtime=0)
     return {
         "glb": base64.b64encode(packed).decode("ascii"),
-        "first": first_look(rays, camera, up_axis),
+        "first": first_look(lit.rays, camera, up_axis),
         "lit": lit_pictures(atlas, exposure),
         "exposure": exposure,
         "irradiance": _typical_irradiance(atlas),
-        "lamps": with_the_weakest_as_one(lamps(atlas, up_axis)),
+        "lamps": with_the_weakest_as_one(lamps(atlas, up_axis, _as_lamps(outside, area))),
+        "area": area,
+        "outside": outside,
     }
 
 
@@ -92,10 +105,17 @@ def lit_pictures(atlas: AssetMaps, exposure: float) -> dict[str, str]:
     return found
 
 
-def lamps(atlas: AssetMaps, up_axis: str) -> list[dict[str, Any]]:
+def _as_lamps(outside: dict[str, Any] | None, area: float) -> float:
+    """The sum of the intensities of lamps that bring as much light as comes from outside."""
+    sources = [source for name in ("sky", "sun") if outside and (source := outside[name])]
+    return area / (4 * np.pi) * sum(sum(source["direct"]) for source in sources)
+
+
+def lamps(atlas: AssetMaps, up_axis: str, beside: float = 0.0) -> list[dict[str, Any]]:
     """Lamps as points that send out as much light, alike in all directions: of an area A that
     shines with radiance L all around itself or to one side, the mean intensity is A L / 4. A few
-    texels of a thing that mirrors a lamp are none."""
+    texels of a thing that mirrors a lamp are none, nor are those that mirror the light from
+    outside, which is as strong as lamps of the intensity ``beside``."""
     turn, texels = turned_up(up_axis, "Y")[:3, :3], atlas.texels
     found: list[dict[str, Any]] = []
     for i, obj in enumerate(atlas.scene.objects):
@@ -111,13 +131,13 @@ def lamps(atlas: AssetMaps, up_axis: str) -> list[dict[str, Any]]:
         found.append(
             {
                 "prim": obj.prim_path,
-                "label": obj.label,
+                "label": obj.label.strip() or obj.identifier,
                 "place": [round(float(value), 4) for value in place],
                 "intensity": [float(value) for value in power.sum(axis=0) / 4],
             }
         )
     strength = [sum(lamp["intensity"]) for lamp in found]
-    least = _FAINT * max(strength, default=0)
+    least = _FAINT * max([*strength, beside])
     return [lamp for lamp, own in zip(found, strength, strict=True) if own >= least]
 
 

@@ -183,7 +183,9 @@ def usd_errors(path: Path) -> Iterator[None]:
 
 
 def one_line(error: object) -> str:
-    return " ".join(words_of(error).split())[:300]
+    """Of an exception what its errors say, without the places in USD's own source."""
+    told = error.args if isinstance(error, Tf.ErrorException) else [error]
+    return "; ".join(" ".join(words_of(part).split()) for part in told)[:300]
 
 
 def words_of(error: object) -> str:

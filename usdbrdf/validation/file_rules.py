@@ -17,12 +17,14 @@ from usdbrdf.asset.manifest import changes
 from usdbrdf.asset.properties import SCHEMA_VERSION
 from usdbrdf.asset.readers.compose import named_files
 from usdbrdf.asset.readers.scene import asset_file
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.files.images import read_exr
 from usdbrdf.job.ownership import edited_files
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, located, record_of, rule
 
 _HEADER = ("metersPerUnit", "upAxis", "timeCodesPerSecond")
 _UDIM = "<UDIM>"
+_PICTURES = frozenset({".exr", ".hdr", ".jpeg", ".jpg", ".png", ".tif", ".tiff"})
 # A letter before a colon is a drive.
 _URI = re.compile(r"[A-Za-z][A-Za-z0-9+-]+:")
 
@@ -178,6 +180,27 @@ def missing_texture(scene: AssetStage) -> Iterator[Fault]:
     for file, sites in _missing(scene):
         more = f" It is named {len(sites)} times." if len(sites) > 1 else ""
         yield Fault(sites[0], f"@{file}@ does not exist.{more}")
+
+
+@rule(Severity.ERROR)
+def unreadable_texture(scene: AssetStage) -> Iterator[Fault]:
+    """Every picture that a layer names can be read to its last pixel. Of one that was cut off, by a
+    copy that was interrupted, renderers show a part, black, or nothing.
+
+    Bring the file back from a copy; or delete it and run usdbrdf convert, which makes it anew."""
+    if not scene.asset:
+        return
+    named: dict[Path, tuple[Sdf.Layer, Sdf.Path]] = {}
+    for layer, path, value in scene.asset_paths:
+        file = located(layer, value)
+        if file.suffix.lower() in _PICTURES and not _URI.match(value) and file.is_file():
+            named.setdefault(file, (layer, path))
+    for file, (layer, path) in sorted(named.items()):
+        try:
+            read_exr(file)
+        except UsdBrdfError as problem:
+            said = str(problem).rpartition(" [")[0].removeprefix(f"{file}: ")
+            yield Fault(_site(scene.stage, layer, path), f"@{file}@: {said}")
 
 
 @rule(Severity.WARNING)

@@ -89,6 +89,9 @@
       el('figcaption', {}, `From above, cut at the cameras\u2019 height: ${map.metres.map(metres).join(' \u00d7 ')}. Dots: cameras; lines: where they look.${map.advised.length ? ' Numbers: photographs that are advised.' : ''}`));
   }
 
+  /* What a terminal is told in ASCII, in the signs that it stands for; nothing breaks inside. */
+  const signs = (text) => text.replaceAll('+-', '\u00b1').replaceAll(' -> ', ' \u2192\u00a0').replaceAll('m^2', 'm\u00b2');
+
   function advice() {
     const { advice: found } = data;
     if (!found) {
@@ -100,7 +103,7 @@
     }
     $('advised').append(
       el('p', { class: 'soft' }, 'The most telling first, each with what it adds to those before it. Numbers as on the map.'),
-      el('ol', {}, ...found.poses.map((pose) => el('li', {}, el('strong', {}, pose.where), ' ', pose.reason))));
+      el('ol', {}, ...found.poses.map((pose) => el('li', {}, el('strong', {}, signs(pose.where)), ' ', signs(pose.reason)))));
   }
 
   function frameChart(title, unit, value, logarithmic) {
@@ -566,7 +569,16 @@
       return;
     }
     window.usdbrdfModel = model;
-    const looks = { shaded: 'lit by its lamps', lit: 'as photographed', base_color: 'base colour', phi: 'roughness \u03c6', psi: 'specular \u03c8', status: 'what is known', verdict: 'verdicts' };
+    const { outside } = data.room;
+    const box = (label, change) => el('label', {},
+      el('input', { type: 'checkbox', checked: true, onchange: (event) => change(event.target.checked) }), ` ${label}`);
+    const lamps = data.room.lamps.map((lamp, i) => box(lamp.label, (shines) => model.setLamp(i, shines)));
+    const sources = ['sky', 'sun'].filter((name) => outside && outside[name]);
+    const daylight = sources.map((name) => {
+      const { error } = outside[name];
+      return box(error === null ? name : `${name} \u00b1 ${percent(error, 0)}`, (shines) => model.setOutside(name, shines));
+    });
+    const looks = { shaded: `lit by ${[...(lamps.length || !outside ? ['its lamps'] : []), ...(outside ? ['daylight'] : [])].join(' and ')}`, lit: 'as photographed', base_color: 'base colour', phi: 'roughness \u03c6', psi: 'specular \u03c8', status: 'what is known', verdict: 'verdicts' };
     const numbers = 'One colour per object. Dark violet: 0; yellow: 1; purple: no number.';
     const legends = {
       phi: numbers, psi: numbers,
@@ -579,8 +591,6 @@
       onchange: () => { model.setLook(look.value); legend.textContent = legends[look.value] || ''; },
     },
       ...Object.entries(looks).map(([value, text]) => el('option', { value }, text)));
-    const lamps = data.room.lamps.map((lamp, i) => el('label', {},
-      el('input', { type: 'checkbox', checked: true, onchange: (event) => model.setLamp(i, event.target.checked) }), ` ${lamp.label}`));
     const range = (label, value, max = 1) => {
       const input = el('input', { type: 'range', min: 0, max, step: 0.01, value, oninput: moved });
       return [input, el('label', {}, `${label} `, input)];
@@ -591,8 +601,9 @@
       el('div', { class: 'bar' }, el('label', {}, 'Look ', look), el('button', { type: 'button', onclick: () => model.home() }, 'back to the start')),
       el('div', { class: 'stage' }, canvas, picked),
       legend,
-      el('p', { class: 'soft' }, 'Drag to turn, scroll to come closer, click an object for its numbers. Light that surfaces send on to each other is one constant here: pictures of relight are exact.'),
+      el('p', { class: 'soft' }, `Drag to turn, scroll to come closer, click an object for its numbers. Light that surfaces send on to each other${outside && outside.sky ? ' and that of the sky are' : ' is'} one constant here: pictures of relight are exact.`),
       el('fieldset', {}, el('legend', {}, 'Captured lamps'), el('div', { class: 'bar' }, ...(lamps.length ? lamps : ['None was found.']))),
+      daylight.length ? el('fieldset', {}, el('legend', {}, outside.estimated ? 'Daylight, as estimated' : 'Daylight, as given'), el('div', { class: 'bar' }, ...daylight)) : '',
       el('fieldset', {}, el('legend', {}, 'A light of your own'), el('div', { class: 'bar' }, a, b, c, d)));
     body.dataset.state = 'model';
   }
@@ -603,7 +614,7 @@
         ? `Photographs: ${data.objects.filter((one) => one.photograph).length} parts around objects and ${data.views.length} whole ones, reduced, without metadata such as EXIF or places; their file names.`
         : 'No photograph and no name of one. What was measured from them, such as textures and the model\u2019s pictures, may still show what they show.',
       `Pictures made from the asset: ${data.views.length} views by two models with error maps, ${data.maps.length} maps, ${data.objects.length} objects, a map of the room.`,
-      data.room ? 'The room as geometry with its textures (glTF), and its lamps.' : 'No geometry.',
+      data.room ? `The room as geometry with its textures (glTF), and its lamps${data.room.outside ? ' and daylight' : ''}.` : 'No geometry.',
       'Names of objects and prims, numbers with their errors, verdicts and comments.',
       'No path of the computer that it was made on, and no address: nothing is loaded when it is opened.',
     ];
