@@ -37,13 +37,17 @@ FRAMES = frames_at(
 @pytest.fixture(scope="module")
 def hall():
     """A room of 6 x 5 x 4 m with two blocks; a panel under the ceiling, and a shelf beside it."""
+    return _hall(1.2)
+
+
+def _hall(panel: float):
     return world_of([
         quad((0, 0, 0), (6, 0, 0), (0, 5, 0), (60, 50)),
         quad((0, 5, 0), (6, 0, 0), (0, 0, 4), (48, 32)),
         quad((0, 0, 0), (0, 5, 0), (0, 0, 4), (40, 32)),
         quad((6, 0, 0), (0, 0, 4), (0, 5, 0), (32, 40)),
         quad((0, 0, 0), (0, 0, 4), (6, 0, 0), (32, 48)),
-        quad((2, 2, 3.95), (0, 1.2, 0), (1.2, 0, 0), (8, 8)),
+        quad((2, 2, 3.95), (0, panel, 0), (panel, 0, 0), (8, 8)),
         quad((4.5, 3.5, 3.0), (0, 1.2, 0), (1.2, 0, 0), (8, 8)),
         quad((0, 0, 4), (0, 5, 0), (6, 0, 0), (30, 36)),
         *box((1, 1, 0.01), (2, 2, 1.2), (20, 20)),
@@ -97,6 +101,15 @@ def test_the_lamp_that_no_frame_shows_is_found_with_its_radiance(hall):
     np.testing.assert_allclose(emitters.radiance[LAMP], found.radiance[0], rtol=1e-5)
     assert found.error_of(LAMP) == pytest.approx(float(found.error[0]))
     assert np.isnan(found.error_of(SHELF))
+
+
+def test_so_is_one_that_is_as_small_as_it_is_bright():
+    # A thumb's width: one of a million rays that look around would meet it.
+    bright = RADIANCE * (1.2 / 0.02) ** 2
+    surface, lit, coverage = _photographed(_hall(0.02), bright, LAMP)
+    found = lamps_that_explain(surface, lit, coverage, FRAMES, 0)
+    assert found.object.tolist() == [LAMP]
+    np.testing.assert_allclose(found.radiance[0], bright, rtol=0.2)
 
 
 def test_a_lamp_is_told_by_what_lies_evenly_in_its_light(hall, monkeypatch):

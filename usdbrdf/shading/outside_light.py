@@ -191,14 +191,19 @@ def _noise_of_segments(asked: Asked, residual: Double, count: int) -> Double:
     """(M,) how much the residuals (N,) of each segment scatter: plain walls tell more than what is
     patterned."""
     off, segment = np.abs(residual[~asked.clipped]), asked.segment[~asked.clipped]
-    middle = np.full(count, np.median(off))
+    return np.maximum(_LEAST_NOISE, 1.4826 * medians_of_segments(off, segment, count))
+
+
+def medians_of_segments(values: Double, segment: Int, count: int) -> Double:
+    """(M,) of values (N,) those of each segment; of one without any that of all."""
+    middle = np.full(count, np.median(values))
     # One sort is much faster than a median of each.
-    ordered, size = off[np.lexsort((off, segment))], np.bincount(segment, minlength=count)
+    ordered, size = values[np.lexsort((values, segment))], np.bincount(segment, minlength=count)
     has = size > 0
     first = (np.cumsum(size) - size)[has]
     lower, upper = first + (size[has] - 1) // 2, first + size[has] // 2
     middle[has] = (ordered[lower] + ordered[upper]) / 2
-    return np.maximum(_LEAST_NOISE, 1.4826 * middle)
+    return middle
 
 
 def _add_priors(

@@ -22,7 +22,7 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.shading.asked import asked_texels, looked_around
+from usdbrdf.shading.asked import LEAST_OF_SEGMENT, asked_texels, first_of_segments, looked_around
 from usdbrdf.shading.clipped_light import ClippedGroups, clipped_groups
 from usdbrdf.shading.lamp_light import (
     ROUGHLY,
@@ -34,20 +34,26 @@ from usdbrdf.shading.lamp_light import (
     strengths,
 )
 from usdbrdf.shading.outside import Outside
-from usdbrdf.shading.outside_light import Asked
+from usdbrdf.shading.outside_light import Asked, medians_of_segments
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
+from usdbrdf.transport.rays import lift_from_surface
 
 _UNSEEN = calibration.number("unseen.most_seen")
-_LEAST_SHARE = calibration.number("unseen.least_share")
 _BRIGHTER = calibration.number("unseen.brighter")
 _LEAST_PART = calibration.number("unseen.least_part")
 _DEVIATION = calibration.number("unseen.deviation")
 _MOST_OPEN = calibration.number("unseen.most_open")
 _MOST_ERROR = calibration.number("unseen.most_error")
-# Rays from each texel that is asked, objects that may shine, and those whose light is traced; of
-# lamps that clip, those with the most light.
-_RAYS, _CANDIDATES, _TRACED, _CLIPPED = 256, 32, 8, 4
+# Rays that look around from each texel that is asked; objects that may shine, and those whose light
+# is traced; of lamps that clip, those with the most light.
+_RAYS, _CANDIDATES, _TRACED, _CLIPPED = 64, 32, 8, 4
+# Which may shine so many texels of a segment tell, each by rays to so many points of an object, for
+# radiances from one to the other, next to that with which it would bring as much as all else.
+_FEW_OF_SEGMENT, _POINTS, _TRIED = 24, 4, np.geomspace(1 / 8, 64, 10)
+# Nearer points than this share of the scene's size count as that far; what is met before this share
+# of the way hides one; and no segment errs less than by this.
+_NEAREST, _REACHED, _LEAST_OFF = 1e-4, 0.99, 0.01
 _SEED = 0x1A3
 
 
@@ -128,18 +134,25 @@ def lamps_that_explain(
     asked = asked_texels(texels, lit, coverage, seed)
     if asked is None or not (seen < _UNSEEN).any():
         return UnseenLamps.none()
-    share, open_share = _shares(surface, asked, seen < _UNSEEN, seed)
-    if open_share > _MOST_OPEN and (outside is None or outside.is_inferred):
-        return UnseenLamps.none()
-    brings = share.mean(axis=1)
-    candidates = np.argsort(-brings, kind="stable")[:_CANDIDATES]
-    candidates = candidates[brings[candidates] > _LEAST_SHARE * np.pi]
-    if not len(candidates):
+    if _open_share(surface, asked, seed) > _MOST_OPEN and (outside is None or outside.is_inferred):
         return UnseenLamps.none()
     groups = clipped_groups(texels, lit, coverage, said)
     asked = asked.of(~groups.texels_of(groups.lamp)[asked.texel])
     environment = outside.environment if outside else black_environment()
-    lamps = _unknown(texels, asked, candidates, groups, said)
+    unseen = np.flatnonzero(seen < _UNSEEN)
+    nothing = np.zeros((len(unseen), 3))
+    few = asked.of(_few_of_segments(asked))
+    few = beside_lamps(
+        surface, lit, environment, few, _unknown(texels, unseen, nothing, groups, said), seed
+    )
+    share = _shares(surface, few, unseen, seed)
+    gain = _gains(few, share)
+    best = np.argsort(-gain, kind="stable")[:_CANDIDATES]
+    best = best[gain[best] > 0]
+    if not len(best):
+        return UnseenLamps.none()
+    candidates, usual = unseen[best], _as_bright_as_the_rest(few, share[best])
+    lamps = _unknown(texels, candidates, usual, groups, said)
     asked = beside_lamps(surface, lit, environment, asked, lamps, seed)
     roughly = brought(surface, lamps, asked.texel, seed, ROUGHLY)
     # Errors of what a lamp brings draw its strength to nothing: this only says which may be one.
@@ -150,8 +163,8 @@ def lamps_that_explain(
     kept = likeliest[likely[likeliest] > _LEAST_PART / 2]
     while len(kept):
         strength = np.append(found[kept], found[len(candidates) :], axis=0).mean(axis=1)
-        candidates = candidates[kept]
-        lamps = _unknown(texels, asked, candidates, groups, said)
+        candidates, usual = candidates[kept], usual[kept]
+        lamps = _unknown(texels, candidates, usual, groups, said)
         found, error, near, part = looked_at_closely(
             surface, lit, environment, frames, asked, lamps, strength, seed
         )
@@ -173,31 +186,92 @@ def lamps_that_explain(
     return UnseenLamps.none()
 
 
-def _shares(surface: TexturedScene, asked: Asked, unseen: Bool, seed: int) -> tuple[Double, float]:
-    """(num_objects, N) W/m^2: what each unseen object of radiance 1 brings to the texels asked; and
-    the share of the light's directions that leave the scan."""
-    count = len(asked.texel)
+def _open_share(surface: TexturedScene, asked: Asked, seed: int) -> float:
+    """The share of the light's directions that leave the scan."""
     _, face = looked_around(surface, asked.texel, seed ^ _SEED, _RAYS)
-    met = np.where(face >= 0, surface.scene.face_object[np.maximum(face, 0)], -1)
-    kept = (met >= 0) & unseen[met]
-    place = met[kept].astype(np.int64) * count + np.arange(len(met))[kept] % count
-    number = np.bincount(place, minlength=len(unseen) * count)
-    brought = np.asarray(np.pi / _RAYS * number.reshape(len(unseen), count), np.float64)
-    return brought, float((face < 0).mean())
+    return float((face < 0).mean())
+
+
+def _few_of_segments(asked: Asked) -> Bool:
+    """(N,): some of the texels asked of each segment."""
+    every = np.arange(int(asked.segment.max()) + 1)
+    kept = first_of_segments(np.arange(len(asked.texel)), asked.segment, every, _FEW_OF_SEGMENT)
+    return np.isin(np.arange(len(asked.texel)), kept)
+
+
+def _shares(surface: TexturedScene, asked: Asked, unseen: Long, seed: int) -> Double:
+    """(K, N) W/m^2: what each of the objects ``unseen`` (K,) of radiance 1 brings to the texels
+    asked, by rays to some of its points: a lamp may be as small as it likes, if it is bright."""
+    texels, random = surface.texels, np.random.default_rng(seed ^ _SEED)
+    normal = texels.normal[asked.texel]
+    origin = lift_from_surface(texels.position[asked.texel], normal, surface.diagonal_m)
+    brought = np.zeros((len(unseen), len(origin)))
+    for own, number in zip(brought, unseen.tolist(), strict=True):
+        first, area = texels.first_texel[number], texels.area[texels.of_object(number)]
+        if not area.sum() > 0:
+            continue
+        below = np.cumsum(area) / area.sum()
+        for _ in range(_POINTS):
+            point = first + np.searchsorted(below[:-1], random.random(len(origin)))
+            towards = texels.position[point] - origin
+            distance = np.maximum(np.linalg.norm(towards, axis=1), _NEAREST * surface.diagonal_m)
+            towards = towards / distance[:, None]
+            cosines = (towards * normal).sum(axis=1), -(towards * texels.normal[point]).sum(axis=1)
+            facing = np.maximum(cosines, 0).prod(axis=0)
+            sent = np.where(facing[:, None] > 0, towards, 0).astype(np.float32)
+            hits = surface.rays.closest(origin, sent)
+            met = (hits.face >= 0) & (surface.scene.face_object[np.maximum(hits.face, 0)] == number)
+            met &= hits.distance > _REACHED * distance
+            own += np.minimum(met * facing * area.sum() / distance**2, np.pi) / _POINTS
+    return brought
+
+
+def _gains(asked: Asked, share: Double) -> Double:
+    """(K,): by how much likelier each source of share (K, N) makes what the texels reflect, if it
+    alone shines, as strong as is likeliest; errors are Laplace's, of each segment its own. 0 of a
+    source that too few texels see."""
+    plain, known = ~asked.clipped, asked.irradiance.mean(axis=1)
+    segment, number = asked.segment[plain], int(asked.segment.max()) + 1
+    size = np.bincount(segment, minlength=number)
+    albedo = (np.log(asked.reflected).mean(axis=1) - np.log(known))[plain]
+
+    def cost(light: Double) -> float:
+        rest = albedo - light
+        off = np.abs(rest - medians_of_segments(rest, segment, number)[segment])
+        mean = np.bincount(segment, off, number) / np.maximum(size, 1)
+        return float(size @ np.log(np.maximum(mean, _LEAST_OFF)))
+
+    gain, alone = np.zeros(len(share)), cost(np.zeros(len(albedo)))
+    for k, own in enumerate((share / known)[:, plain]):
+        sees = own > 0
+        if np.count_nonzero(sees) >= LEAST_OF_SEGMENT:
+            relative = own / np.median(own[sees])
+            gain[k] = alone - min(cost(np.log1p(s * relative)) for s in _TRIED)
+    return gain
+
+
+def _as_bright_as_the_rest(asked: Asked, share: Double) -> Double:
+    """(K, 3): the logarithm of the radiance with which each source would bring as much as all else
+    to the texels that see it: in itself a lamp may be as bright as it is small."""
+    rest = np.log(asked.irradiance)
+    sees = [np.flatnonzero(own) for own in share]
+    each = zip(share, sees, strict=True)
+    return np.stack(
+        [np.median(rest[some] - np.log(own[some])[:, None], axis=0) for own, some in each]
+    )
 
 
 def _unknown(
-    texels: Texels, asked: Asked, objects: Long, groups: ClippedGroups, said: Mapping[int, bool]
+    texels: Texels, objects: Long, usual: Double, groups: ClippedGroups, said: Mapping[int, bool]
 ) -> Lamps:
-    """Objects (K,) that may be lamps, of which nothing else is known, and after them those that
-    clip."""
-    usual = np.log(np.median(asked.reflected, axis=0) / np.pi)
+    """Objects (K,) that may be lamps, of which nothing is known but the logarithm of the radiance
+    that would be usual, (K, 3), and after them those that clip."""
     number = np.full(len(texels.resolution), -1, np.int32)
     number[objects] = np.arange(len(objects))
     clipped = groups.as_lamps(np.flatnonzero(groups.lamp)[:_CLIPPED])
     return Lamps(
         np.where(clipped.of >= 0, clipped.of + len(objects), number[texels.object_index()]),
-        np.concatenate([np.tile(usual, (len(objects), 1)), clipped.mean]),
+        np.concatenate([usual, clipped.mean]),
         np.concatenate([np.full(len(objects), _DEVIATION), clipped.deviation]),
         np.array([*(said.get(int(i), False) for i in objects), *clipped.certain], np.bool_),
     )
