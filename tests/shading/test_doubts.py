@@ -14,7 +14,7 @@ def _shaded(*, emits=False, outside=None, error=0.01, over_one=0.0, escaped=0.0)
     """Of one object that reflects, and as much of the light as the sentences speak of."""
     nothing = SimpleNamespace()
     return Shaded(
-        observed=np.ones(4, np.bool_),
+        measured=np.ones(4, np.bool_),
         light=nothing,
         unseen=nothing,
         traced=SimpleNamespace(escaped=np.full(4, escaped)),

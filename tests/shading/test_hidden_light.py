@@ -126,6 +126,29 @@ def test_what_was_seen_and_what_shines_stay_as_they_were(by_lamp):
     np.testing.assert_array_equal(found[back], filled[back])
 
 
+def test_what_clips_reflects_what_it_receives_and_no_less_than_it_shows(by_lamp):
+    world, true, filled, hidden = by_lamp
+    owner, top = world.texels.object_index(), (world.texels.normal[:, 2] > 0.9) & ~hidden
+    # Half of the table's top clips, of which a half shows more than it would reflect.
+    half = np.flatnonzero(top & (owner == TABLE))[::2]
+    shown, clipped = filled.copy(), np.zeros(len(hidden), np.bool_)
+    clipped[half] = True
+    shown[half] *= 0.25
+    shown[half[::2]] *= 8
+    surface = TexturedScene(world.scene, world.texels, world.rays)
+    coverage = CoverageMap.of(~hidden & ~clipped, clipped)
+    lamps = KnownLamps(owner == LAMP, {})
+    found = light_of_hidden(surface, shown, coverage, black_environment(), 3, lamps)
+    np.testing.assert_allclose(
+        found[half[1::2]].mean(axis=0), true[half[1::2]].mean(axis=0), rtol=0.1
+    )
+    np.testing.assert_array_equal(found[half[::2]], shown[half[::2]])
+    # Until it is known whether they shine they keep their bounds.
+    lamps = KnownLamps((owner == LAMP) | clipped, {})
+    found = light_of_hidden(surface, shown, coverage, black_environment(), 3, lamps)
+    np.testing.assert_array_equal(found[half], shown[half])
+
+
 def test_a_lamp_of_unknown_strength_makes_no_underside_bright(by_lamp):
     """All but the lamp is measured, which counts a tenth of what it is: what it shines on seems to
     reflect several times what it receives."""
@@ -161,7 +184,7 @@ def test_what_stands_in_a_sun_that_is_not_known_yet_is_no_lamp():
         np.zeros(len(hidden), bool),
     )
     found = light_of_hidden(
-        surface, filled, CoverageMap.of(~hidden, none), sky, 3, KnownLamps.unknown(len(hidden))
+        surface, filled, CoverageMap.of(~hidden, none), sky, 3, KnownLamps.unknown(none)
     )
     under = (owner == TABLE) & hidden
     assert filled[under].mean() > 2.5 * true[under].mean()

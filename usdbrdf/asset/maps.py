@@ -221,13 +221,13 @@ class AssetMaps:
 
     @property
     def hidden(self) -> Bool:
-        """(T,): no frame shows the texel, and it does not shine."""
-        return ~(self.coverage.observed | self.emissive)
+        """(T,): no frame measures the texel, and it does not shine."""
+        return ~(self.coverage.measured | self.emissive)
 
     @property
     def light(self) -> Float:
         """(T, 3) W/(m^2 sr): what the surface sends out: L_d, and what shading found of lamps (of
-        those that clipped in every frame L_d is only a lower bound) and of what no frame shows."""
+        what clipped in every frame L_d is only a lower bound) and of what no frame measures."""
         light = np.where(self.emissive[:, None], self.emission, self.lit)
         if self.has("hidden"):
             hidden = self.hidden
@@ -272,14 +272,16 @@ class AssetMaps:
 
     def light_in_doubt(self, asked: Surroundings) -> LitScene | None:
         """The scene in nothing but the standard errors of its light: of lamps and surroundings that
-        were inferred, and of what surfaces send out that no frame shows; None where all of that was
-        seen. What a file says of the surroundings is not doubted."""
+        were inferred, and of what surfaces send out that no frame measures; None where all of that
+        was seen. What a file says of the surroundings is not doubted."""
         doubts = self.doubts_of_light
         of_object = [doubts.get(obj.prim_path, 0.0) for obj in self.scene.objects]
         error = np.array(of_object, np.float32)[self.texels.object_index()]
         inferred = self.emissive & ~self.coverage.measured & (error > 0)
         light = np.where(inferred[:, None], error[:, None] * self.emission, np.float32(0))
-        light[self.hidden] = _OF_HIDDEN * self.light[self.hidden]
+        # What clips and reflects no more than it shows is as bright as that.
+        guessed = self.hidden & ~(self.coverage.clipped & (self.light <= self.lit).all(axis=1))
+        light[guessed] = _OF_HIDDEN * self.light[guessed]
         outside = self._doubts_of_outside() if asked == ESTIMATE else black_environment()
         if not (light.any() or outside.image.any() or outside.sun.shines):
             return None

@@ -1,13 +1,14 @@
-"""The light of what no frame shows: undersides, backs, what stands behind something.
+"""The light of what no frame measures: undersides, backs, what stands behind something; and what is
+so bright that it clips in all of them, as walls in the sun do.
 
-Texturing fills it with the radiance beside it, which knows nothing of the light there: the
+Texturing fills the former with the radiance beside it, which knows nothing of the light there: the
 underside of a table would shine like its top in the sun. What was seen of an object tells its
 albedo, and what receives S sends out
 
     L = albedo S / pi
 
-S is traced at some of the texels with all other light; in two rounds, for hidden surfaces see each
-other.
+and no less than it shows where it clips. S is traced at some of the texels with all other light; in
+two rounds, for hidden surfaces see each other.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _RIM, _LEAK = 3, 2.0
 
 
 class KnownLamps(NamedTuple):
-    """What shines for certain, ``texel`` (T,), keeps its radiance; so do objects more than a part
+    """What may shine, ``texel`` (T,), keeps its radiance; so do objects more than a part
     ``most`` of whose seen texels send out more than they can reflect, but for those of ``said``,
     by number, whose lamps a person knows. doubt: relative standard error of what is received."""
 
@@ -53,10 +54,10 @@ class KnownLamps(NamedTuple):
     doubt: float = 0.0
 
     @classmethod
-    def unknown(cls, count: int) -> KnownLamps:
-        """Of ``count`` texels nothing is known, nor where the sun shines: what stands in it is told
-        from a lamp by its sides, which are in the shade."""
-        return cls(np.zeros(count, np.bool_), {}, _AS_A_WHOLE)
+    def unknown(cls, clipped: Bool) -> KnownLamps:
+        """Nothing is known of lamps, nor where the sun shines: what stands in it is told from a
+        lamp by its sides, which are in the shade; what is ``clipped`` (T,) may be either."""
+        return cls(clipped, {}, _AS_A_WHOLE)
 
 
 def with_hidden_light(
@@ -91,15 +92,15 @@ def light_of_hidden(
     lamps: KnownLamps,
     start: Float | None = None,
 ) -> Float:
-    """(T, 3) W/(m^2 sr): ``lit``, L_d, and of texels that no frame shows what they reflect of it
+    """(T, 3) W/(m^2 sr): ``lit``, L_d, and of texels that no frame measures what they reflect of it
     and of the ``environment``, but for ``lamps``. start (T, 3): what is known of that before."""
-    texels = surface.texels
-    shown, tells = coverage.observed | lamps.texel, coverage.measured & ~lamps.texel
-    every = np.flatnonzero(~shown)
-    seen, hidden = _spread(texels, tells), _spread(texels, ~shown)
+    texels, known = surface.texels, coverage.measured | lamps.texel
+    every = np.flatnonzero(~known)
+    seen, hidden = _spread(texels, coverage.measured & ~lamps.texel), _spread(texels, ~known)
     if not len(hidden) or not len(seen):
         return lit
-    beside = beside_seen(texels, shown)[every]
+    beside = beside_seen(texels, coverage.observed | lamps.texel)[every]
+    bounded = coverage.clipped[every]
     filled, light, both = lit[every], lit.copy(), np.concatenate([seen, hidden])
     if start is not None:
         light[every] = start[every]
@@ -112,7 +113,9 @@ def light_of_hidden(
         receives, reaches = traced[: len(seen)], traced[len(seen) :]
         albedo, lamp = _albedo(texels, seen, lit[seen], receives, every, lamps)
         sent = albedo * _spread_out(texels, hidden, reaches, every) / np.pi
-        light[every] = np.where(lamp[:, None], filled, without_leaks(sent, filled, beside))
+        sent = without_leaks(sent, filled, beside)
+        sent[bounded] = np.maximum(sent, filled)[bounded]
+        light[every] = np.where(lamp[:, None], filled, sent)
     return light
 
 

@@ -146,7 +146,7 @@ def estimated_outside(
     def compute() -> dict[str, Array]:
         seen = surroundings_from_frames(surface.rays, frames, z_up)
         # What hides in a room would shine like what stands in the sun beside it.
-        lamps, known = KnownLamps.unknown(len(lit)), _of_measured(seen, z_up)
+        lamps, known = KnownLamps.unknown(coverage.clipped), _of_measured(seen, z_up)
         light = light_of_hidden(surface, lit, coverage, known, seed, lamps)
         mirrored = mirroring(surface, light, frames, seed)
         found = light_from_outside(surface, light, coverage, seen, z_up, seed, mirrored)

@@ -215,9 +215,9 @@ _MANY_OVER_ONE, _MOSTLY_OPEN, _NOISY = 0.05, 0.5, 0.2
 class Shaded:
     """What is known of all texels.
 
-    observed        (T,): a frame shows it
+    measured        (T,): a frame does
     light           L_d (T, 3) with the estimated radiance of lamps that clipped, and with what
-                    hidden surfaces reflect
+                    other surfaces reflect that no frame measures
     unseen          lamps that no frame shows
     traced          S as it was traced
     relative_error  (T,) float32 of that
@@ -229,7 +229,7 @@ class Shaded:
     outside         the light from outside; None for none
     """
 
-    observed: Bool
+    measured: Bool
     light: ClippedLight
     unseen: UnseenLamps
     traced: Irradiance
@@ -248,10 +248,10 @@ class Shaded:
 
     @property
     def hidden(self) -> Float:
-        """(T, 3) W/(m^2 sr): what texels that no frame shows are taken to reflect, zero on all
+        """(T, 3) W/(m^2 sr): what texels that no frame measures are taken to reflect, zero on all
         else."""
-        shown = self.observed | self.emitters.emissive
-        return np.where(shown[:, None], np.float32(0), self.light.lit)
+        known = self.measured | self.emitters.emissive
+        return np.where(known[:, None], np.float32(0), self.light.lit)
 
     def radiance_status(self, index: int) -> str:
         """How the radiance of what shines on an object is known: "measured"; where no frame
@@ -345,18 +345,20 @@ def _light(
     owner = texels.object_index()
     groups = clipped_groups(texels, lit, coverage, said)
     told = np.isin(owner, [number for number, is_lamp in said.items() if is_lamp])
-    known = KnownLamps(told | groups.texels_of(groups.lamp), said, doubt=doubt)
+    # What clips may be a lamp, or reflect what is not known yet.
+    may_shine = told | coverage.clipped | groups.texels_of(groups.lamp)
+    known = KnownLamps(may_shine, said, doubt=doubt)
     lit = with_hidden_light(run, "hidden", surface, lit, coverage, environment, seed, known)
     # In the light of what it may be that no frame shows.
     unseen = estimate_unseen_lamps(run, surface, lit, coverage, frames, outside, seed, said)
     lit = unseen.with_light(texels, lit)
     light = estimate_clipped_light(run, surface, lit, coverage, frames, environment, seed, said)
     lamps = light.groups.texels_of(light.groups.lamp) | np.isin(owner, unseen.object)
-    if (light.lit[lamps] == filled[lamps]).all() and not (known.texel & ~told & ~lamps).any():
+    if (light.lit[lamps] == filled[lamps]).all() and not (may_shine & ~told & ~lamps).any():
         return light, unseen
-    # Hidden surfaces send on the light of these as well, and none of what is no lamp after all.
+    # Hidden surfaces send on the light of these as well; what clips and is no lamp reflects it.
     known = KnownLamps(told | lamps, said, doubt=doubt)
-    lamplit = np.where((coverage.observed | known.texel)[:, None], light.lit, filled)
+    lamplit = np.where((coverage.measured | known.texel)[:, None], light.lit, filled)
     given = lamplit, coverage, environment, seed, known, light.lit
     return replace(light, lit=with_hidden_light(run, "hidden-lit", surface, *given)), unseen
 
@@ -397,7 +399,7 @@ def shade_surface(
     level = np.maximum(traced.mean.mean(axis=1), 1e-30)
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / level
     return Shaded(
-        observed=coverage.observed, light=light, traced=traced, relative_error=relative,
+        measured=coverage.measured, light=light, traced=traced, relative_error=relative,
         irradiance=irradiance, unseen=unseen, emitters=emitters, albedo=albedo, unexplained=over,
         outside=outside,
         over_one=float(over.sum() / max((seen & ~emitters.emissive).sum(), 1)),

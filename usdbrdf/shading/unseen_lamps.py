@@ -35,7 +35,7 @@ from usdbrdf.shading.lamp_light import (
 )
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.outside_light import Asked, medians_of_segments
-from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import lift_from_surface
 
@@ -140,18 +140,9 @@ def lamps_that_explain(
     asked = asked.of(~groups.texels_of(groups.lamp)[asked.texel])
     environment = outside.environment if outside else black_environment()
     unseen = np.flatnonzero(seen < _UNSEEN)
-    nothing = np.zeros((len(unseen), 3))
-    few = asked.of(_few_of_segments(asked))
-    few = beside_lamps(
-        surface, lit, environment, few, _unknown(texels, unseen, nothing, groups, said), seed
-    )
-    share = _shares(surface, few, unseen, seed)
-    gain = _gains(few, share)
-    best = np.argsort(-gain, kind="stable")[:_CANDIDATES]
-    best = best[gain[best] > 0]
-    if not len(best):
+    candidates, usual = _candidates(surface, lit, environment, asked, unseen, groups, said, seed)
+    if not len(candidates):
         return UnseenLamps.none()
-    candidates, usual = unseen[best], _as_bright_as_the_rest(few, share[best])
     lamps = _unknown(texels, candidates, usual, groups, said)
     asked = beside_lamps(surface, lit, environment, asked, lamps, seed)
     roughly = brought(surface, lamps, asked.texel, seed, ROUGHLY)
@@ -190,6 +181,33 @@ def _open_share(surface: TexturedScene, asked: Asked, seed: int) -> float:
     """The share of the light's directions that leave the scan."""
     _, face = looked_around(surface, asked.texel, seed ^ _SEED, _RAYS)
     return float((face < 0).mean())
+
+
+def _candidates(
+    surface: TexturedScene,
+    lit: Float,
+    environment: Environment,
+    asked: Asked,
+    unseen: Long,
+    groups: ClippedGroups,
+    said: Mapping[int, bool],
+    seed: int,
+) -> tuple[Long, Double]:
+    """Of the objects ``unseen`` (K,) those that explain most if they shine, the best first, and of
+    each the logarithm of the radiance with which it would bring as much as all else to the texels
+    that see it, (K, 3): in itself a lamp may be as bright as it is small."""
+    nothing = np.zeros((len(unseen), 3))
+    lamps = _unknown(surface.texels, unseen, nothing, groups, said)
+    few = beside_lamps(surface, lit, environment, asked.of(_few_of_segments(asked)), lamps, seed)
+    share = _shares(surface, few, unseen, seed)
+    gain = _gains(few, share)
+    best = np.argsort(-gain, kind="stable")[:_CANDIDATES]
+    best = best[gain[best] > 0]
+    usual, rest = np.zeros((len(best), 3)), np.log(few.irradiance)
+    for level, own in zip(usual, share[best], strict=True):
+        sees = np.flatnonzero(own)
+        level[:] = np.median(rest[sees] - np.log(own[sees])[:, None], axis=0)
+    return unseen[best], usual
 
 
 def _few_of_segments(asked: Asked) -> Bool:
@@ -248,17 +266,6 @@ def _gains(asked: Asked, share: Double) -> Double:
             relative = own / np.median(own[sees])
             gain[k] = alone - min(cost(np.log1p(s * relative)) for s in _TRIED)
     return gain
-
-
-def _as_bright_as_the_rest(asked: Asked, share: Double) -> Double:
-    """(K, 3): the logarithm of the radiance with which each source would bring as much as all else
-    to the texels that see it: in itself a lamp may be as bright as it is small."""
-    rest = np.log(asked.irradiance)
-    sees = [np.flatnonzero(own) for own in share]
-    each = zip(share, sees, strict=True)
-    return np.stack(
-        [np.median(rest[some] - np.log(own[some])[:, None], axis=0) for own, some in each]
-    )
 
 
 def _unknown(
