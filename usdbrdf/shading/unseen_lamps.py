@@ -45,9 +45,9 @@ _LEAST_PART = calibration.number("unseen.least_part")
 _DEVIATION = calibration.number("unseen.deviation")
 _MOST_OPEN = calibration.number("unseen.most_open")
 _MOST_ERROR = calibration.number("unseen.most_error")
-# Rays that look around from each texel that is asked; objects that may shine, and those whose light
-# is traced; of lamps that clip, those with the most light.
-_RAYS, _CANDIDATES, _TRACED, _CLIPPED = 64, 32, 8, 4
+# Rays that look around from each texel that is asked; objects that may shine, at most, at first and
+# in the end, and by how much likelier they must make what is seen; lamps that clip, the strongest.
+_RAYS, _MANY, _CANDIDATES, _LEAST_GAIN, _CLIPPED = 64, 64, 8, 10.0, 4
 # Which may shine so many texels of a segment tell, each by rays to so many points of an object, for
 # radiances from one to the other, next to that with which it would bring as much as all else.
 _FEW_OF_SEGMENT, _POINTS, _TRIED = 24, 4, np.geomspace(1 / 8, 64, 10)
@@ -150,7 +150,7 @@ def lamps_that_explain(
     found, error, near, part = strengths(asked, sources_of(lamps, roughly), lamps.certain)
     likely = np.where((np.pi * found.mean(axis=1) > near) & (error < 1), part, 0)
     likely = likely[: len(candidates)]
-    likeliest = np.argsort(-likely, kind="stable")[:_TRACED]
+    likeliest = np.argsort(-likely, kind="stable")
     kept = likeliest[likely[likeliest] > _LEAST_PART / 2]
     while len(kept):
         strength = np.append(found[kept], found[len(candidates) :], axis=0).mean(axis=1)
@@ -193,16 +193,15 @@ def _candidates(
     said: Mapping[int, bool],
     seed: int,
 ) -> tuple[Long, Double]:
-    """Of the objects ``unseen`` (K,) those that explain most if they shine, the best first, and of
+    """Of the objects ``unseen`` those that explain most if they shine, (K,), the best first, and of
     each the logarithm of the radiance with which it would bring as much as all else to the texels
     that see it, (K, 3): in itself a lamp may be as bright as it is small."""
     nothing = np.zeros((len(unseen), 3))
     lamps = _unknown(surface.texels, unseen, nothing, groups, said)
     few = beside_lamps(surface, lit, environment, asked.of(_few_of_segments(asked)), lamps, seed)
-    share = _shares(surface, few, unseen, seed)
-    gain = _gains(few, share)
-    best = np.argsort(-gain, kind="stable")[:_CANDIDATES]
-    best = best[gain[best] > 0]
+    share = _shares(surface, few, lamps, seed)
+    # Those that clip are among them, lest another stands for their light.
+    best = np.array([k for k in _likeliest(few, share) if k < len(unseen)], np.int64)
     usual, rest = np.zeros((len(best), 3)), np.log(few.irradiance)
     for level, own in zip(usual, share[best], strict=True):
         sees = np.flatnonzero(own)
@@ -217,20 +216,21 @@ def _few_of_segments(asked: Asked) -> Bool:
     return np.isin(np.arange(len(asked.texel)), kept)
 
 
-def _shares(surface: TexturedScene, asked: Asked, unseen: Long, seed: int) -> Double:
-    """(K, N) W/m^2: what each of the objects ``unseen`` (K,) of radiance 1 brings to the texels
-    asked, by rays to some of its points: a lamp may be as small as it likes, if it is bright."""
+def _shares(surface: TexturedScene, asked: Asked, lamps: Lamps, seed: int) -> Double:
+    """(K, N) W/m^2: what each of the ``lamps`` of radiance 1 brings to the texels asked, by rays to
+    some of its points: it may be as small as it likes, if it is bright."""
     texels, random = surface.texels, np.random.default_rng(seed ^ _SEED)
-    normal = texels.normal[asked.texel]
+    normal, owner = texels.normal[asked.texel], texels.object_index()
     origin = lift_from_surface(texels.position[asked.texel], normal, surface.diagonal_m)
-    brought = np.zeros((len(unseen), len(origin)))
-    for own, number in zip(brought, unseen.tolist(), strict=True):
-        first, area = texels.first_texel[number], texels.area[texels.of_object(number)]
-        if not area.sum() > 0:
-            continue
-        below = np.cumsum(area) / area.sum()
-        for _ in range(_POINTS):
-            point = first + np.searchsorted(below[:-1], random.random(len(origin)))
+    shining = np.flatnonzero((lamps.of >= 0) & (texels.area > 0))
+    shining = shining[np.argsort(lamps.of[shining], kind="stable")]
+    ends = np.searchsorted(lamps.of[shining], np.arange(len(lamps.mean) + 1))
+    brought = np.zeros((len(lamps.mean), len(origin)))
+    for share, start, end in zip(brought, ends[:-1], ends[1:], strict=True):
+        own = shining[start:end]
+        below, number = np.cumsum(texels.area[own], dtype=np.float64), owner[own[:1]]
+        for _ in range(_POINTS if len(own) else 0):
+            point = own[np.searchsorted(below[:-1], below[-1] * random.random(len(origin)))]
             towards = texels.position[point] - origin
             distance = np.maximum(np.linalg.norm(towards, axis=1), _NEAREST * surface.diagonal_m)
             towards = towards / distance[:, None]
@@ -240,32 +240,48 @@ def _shares(surface: TexturedScene, asked: Asked, unseen: Long, seed: int) -> Do
             hits = surface.rays.closest(origin, sent)
             met = (hits.face >= 0) & (surface.scene.face_object[np.maximum(hits.face, 0)] == number)
             met &= hits.distance > _REACHED * distance
-            own += np.minimum(met * facing * area.sum() / distance**2, np.pi) / _POINTS
+            share += np.minimum(met * facing * below[-1] / distance**2, np.pi) / _POINTS
     return brought
 
 
-def _gains(asked: Asked, share: Double) -> Double:
-    """(K,): by how much likelier each source of share (K, N) makes what the texels reflect, if it
-    alone shines, as strong as is likeliest; errors are Laplace's, of each segment its own. 0 of a
-    source that too few texels see."""
-    plain, known = ~asked.clipped, asked.irradiance.mean(axis=1)
+def _likeliest(asked: Asked, share: Double) -> list[int]:
+    """Which sources of share (K, N) make what the texels reflect likelier if they shine, as strong
+    as is likeliest, one after the other: the next is the one that adds most to those before it."""
+    chosen, light = list[int](), asked.irradiance.mean(axis=1)
+    left = np.flatnonzero(((share > 0) & ~asked.clipped).sum(axis=1) >= LEAST_OF_SEGMENT)
+    while len(left) and len(chosen) < _CANDIDATES:
+        found = [_alone(asked, light, share[k]) for k in left]
+        gain = np.array([of_one for of_one, _ in found])
+        best = int(gain.argmax())
+        if gain[best] < _LEAST_GAIN:
+            break
+        chosen.append(int(left[best]))
+        light = light + found[best][1] * share[left[best]]
+        left = left[np.argsort(-gain, kind="stable")[1:_MANY]]
+    return chosen
+
+
+def _alone(asked: Asked, light: Double, share: Double) -> tuple[float, float]:
+    """By how much likelier a source of share (N,) beside the ``light`` (N,) makes what the texels
+    reflect, errors being Laplace's, of each segment its own; and the radiance at which it does."""
+    plain = ~asked.clipped
     segment, number = asked.segment[plain], int(asked.segment.max()) + 1
     size = np.bincount(segment, minlength=number)
-    albedo = (np.log(asked.reflected).mean(axis=1) - np.log(known))[plain]
+    reflected, light, share = (
+        np.log(asked.reflected).mean(axis=1)[plain],
+        light[plain],
+        share[plain],
+    )
 
-    def cost(light: Double) -> float:
-        rest = albedo - light
+    def cost(radiance: float) -> float:
+        rest = reflected - np.log(light + radiance * share)
         off = np.abs(rest - medians_of_segments(rest, segment, number)[segment])
         mean = np.bincount(segment, off, number) / np.maximum(size, 1)
         return float(size @ np.log(np.maximum(mean, _LEAST_OFF)))
 
-    gain, alone = np.zeros(len(share)), cost(np.zeros(len(albedo)))
-    for k, own in enumerate((share / known)[:, plain]):
-        sees = own > 0
-        if np.count_nonzero(sees) >= LEAST_OF_SEGMENT:
-            relative = own / np.median(own[sees])
-            gain[k] = alone - min(cost(np.log1p(s * relative)) for s in _TRIED)
-    return gain
+    usual = float(np.median(light[share > 0] / share[share > 0]))
+    costs = [cost(usual * tried) for tried in _TRIED]
+    return cost(0.0) - min(costs), usual * float(_TRIED[np.argmin(costs)])
 
 
 def _unknown(
