@@ -230,8 +230,10 @@ class AssetMaps:
         what clipped in every frame L_d is only a lower bound) and of what no frame measures."""
         light = np.where(self.emissive[:, None], self.emission, self.lit)
         if self.has("hidden"):
-            hidden = self.hidden
-            light[hidden] = self.map_where_present("hidden", 3)[hidden]
+            hidden, clipped = self.hidden, self.coverage.clipped[:, None]
+            # Older assets have nothing in it of what clips.
+            least = np.where(clipped, self.lit, np.float32(0))
+            light[hidden] = np.maximum(self.map_where_present("hidden", 3), least)[hidden]
         return light
 
     def environment(self, asked: Surroundings) -> Environment:
