@@ -223,6 +223,7 @@ ENGINEERING: dict[str, str] = {
     "_FEWEST_PIXELS": "memory",
     "_FEWEST_VIEWS": "views that a statistic needs",
     "_FEW_OF_SEGMENT": "time: how many are asked",
+    "_FEW_POINTS": "time: how many are asked",
     "_FINER": "steps of a search",
     "_FIRST_GUESS": "start and end of a search",
     "_FIRST_RAYS": "rays: noise against time",

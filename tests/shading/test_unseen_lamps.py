@@ -40,7 +40,8 @@ def hall():
     return _hall(1.2)
 
 
-def _hall(panel: float):
+def _hall(panel: float, below: int = 0):
+    """With so many things of 8 cm below the panel, each by itself."""
     return world_of([
         quad((0, 0, 0), (6, 0, 0), (0, 5, 0), (60, 50)),
         quad((0, 5, 0), (6, 0, 0), (0, 0, 4), (48, 32)),
@@ -52,6 +53,7 @@ def _hall(panel: float):
         quad((0, 0, 4), (0, 5, 0), (6, 0, 0), (30, 36)),
         *box((1, 1, 0.01), (2, 2, 1.2), (20, 20)),
         *box((3.5, 2.5, 0.01), (4.5, 3.5, 2.0), (20, 20)),
+        *(quad((2.2 + k / 10, 2.5, 3.8), (0, 0.08, 0), (0.08, 0, 0), (4, 4)) for k in range(below)),
     ])  # fmt: skip
 
 
@@ -110,6 +112,18 @@ def test_so_is_one_that_is_as_small_as_it_is_bright():
     found = lamps_that_explain(surface, lit, coverage, FRAMES, 0)
     assert found.object.tolist() == [LAMP]
     np.testing.assert_allclose(found.radiance[0], bright, rtol=0.2)
+
+
+def test_what_hangs_below_a_lamp_is_not_taken_for_it():
+    # A point there explains nearly as much.
+    hall = _hall(1.2, below=6)
+    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
+    small = surface.texels.object_index() >= len(hall.texels.resolution) - 6
+    lit = np.where(small[:, None], np.median(lit[~small], axis=0), lit).astype(np.float32)
+    coverage = CoverageMap.of(coverage.observed & ~small, np.zeros(len(small), np.bool_))
+    found = lamps_that_explain(surface, lit, coverage, FRAMES, 0)
+    assert found.object.tolist() == [LAMP]
+    np.testing.assert_allclose(found.radiance[0], RADIANCE, rtol=0.2)
 
 
 def test_a_lamp_is_told_by_what_lies_evenly_in_its_light(hall, monkeypatch):

@@ -230,10 +230,11 @@ class AssetMaps:
         what clipped in every frame L_d is only a lower bound) and of what no frame measures."""
         light = np.where(self.emissive[:, None], self.emission, self.lit)
         if self.has("hidden"):
-            hidden, clipped = self.hidden, self.coverage.clipped[:, None]
+            hidden = np.flatnonzero(self.hidden)
+            found = self.map_where_present("hidden", 3)[hidden]
             # Older assets have nothing in it of what clips.
-            least = np.where(clipped, self.lit, np.float32(0))
-            light[hidden] = np.maximum(self.map_where_present("hidden", 3), least)[hidden]
+            told = found.any(axis=1) | ~self.coverage.clipped[hidden]
+            light[hidden[told]] = found[told]
         return light
 
     def environment(self, asked: Surroundings) -> Environment:
@@ -282,8 +283,10 @@ class AssetMaps:
         inferred = self.emissive & ~self.coverage.measured & (error > 0)
         light = np.where(inferred[:, None], error[:, None] * self.emission, np.float32(0))
         # What clips and reflects no more than it shows is as bright as that.
-        guessed = self.hidden & ~(self.coverage.clipped & (self.light <= self.lit).all(axis=1))
-        light[guessed] = _OF_HIDDEN * self.light[guessed]
+        sent = self.light
+        as_shown = self.coverage.clipped & (sent.max(axis=1) <= 1.001 * self.lit.max(axis=1))
+        guessed = self.hidden & ~as_shown
+        light[guessed] = _OF_HIDDEN * sent[guessed]
         outside = self._doubts_of_outside() if asked == ESTIMATE else black_environment()
         if not (light.any() or outside.image.any() or outside.sun.shines):
             return None

@@ -96,7 +96,10 @@ def light_of_hidden(
     and of the ``environment``, but for ``lamps``. start (T, 3): what is known of that before."""
     texels, known = surface.texels, coverage.measured | lamps.texel
     every = np.flatnonzero(~known)
-    seen, hidden = _spread(texels, coverage.measured & ~lamps.texel), _spread(texels, ~known)
+    seen = _spread(texels, coverage.measured & ~lamps.texel)
+    # Apart, for of a small part that clips little is traced among all that hides.
+    kinds = (~known & coverage.clipped, ~known & ~coverage.clipped)
+    hidden = np.union1d(*(_spread(texels, kind) for kind in kinds))
     if not len(hidden) or not len(seen):
         return lit
     beside = beside_seen(texels, coverage.observed | lamps.texel)[every]
@@ -114,7 +117,9 @@ def light_of_hidden(
         albedo, lamp = _albedo(texels, seen, lit[seen], receives, every, lamps)
         sent = albedo * _spread_out(texels, hidden, reaches, every) / np.pi
         sent = without_leaks(sent, filled, beside)
-        sent[bounded] = np.maximum(sent, filled)[bounded]
+        # Whole, with its hue: one channel alone may have clipped.
+        held = bounded & (filled.max(axis=1) > sent.max(axis=1))
+        sent[held] = filled[held]
         light[every] = np.where(lamp[:, None], filled, sent)
     return light
 

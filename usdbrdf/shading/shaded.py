@@ -358,7 +358,7 @@ def _light(
         return light, unseen
     # Hidden surfaces send on the light of these as well; what clips and is no lamp reflects it.
     known = KnownLamps(told | lamps, said, doubt=doubt)
-    lamplit = np.where((coverage.measured | known.texel)[:, None], light.lit, filled)
+    lamplit = np.where((coverage.observed | known.texel)[:, None], light.lit, filled)
     given = lamplit, coverage, environment, seed, known, light.lit
     return replace(light, lit=with_hidden_light(run, "hidden-lit", surface, *given)), unseen
 

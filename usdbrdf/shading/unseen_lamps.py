@@ -10,7 +10,7 @@ told from lamps that no frame shows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -22,7 +22,7 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.shading.asked import LEAST_OF_SEGMENT, asked_texels, first_of_segments, looked_around
+from usdbrdf.shading.asked import asked_texels, first_of_segments, looked_around
 from usdbrdf.shading.clipped_light import ClippedGroups, clipped_groups
 from usdbrdf.shading.lamp_light import (
     ROUGHLY,
@@ -45,12 +45,14 @@ _LEAST_PART = calibration.number("unseen.least_part")
 _DEVIATION = calibration.number("unseen.deviation")
 _MOST_OPEN = calibration.number("unseen.most_open")
 _MOST_ERROR = calibration.number("unseen.most_error")
-# Rays that look around from each texel that is asked; objects that may shine, at most, at first and
-# in the end, and by how much likelier they must make what is seen; lamps that clip, the strongest.
-_RAYS, _MANY, _CANDIDATES, _LEAST_GAIN, _CLIPPED = 64, 64, 8, 10.0, 4
-# Which may shine so many texels of a segment tell, each by rays to so many points of an object, for
-# radiances from one to the other, next to that with which it would bring as much as all else.
-_FEW_OF_SEGMENT, _POINTS, _TRIED = 24, 4, np.geomspace(1 / 8, 64, 10)
+# Rays that look around from each texel that is asked; objects that may shine, at most, and by how
+# much likelier they must make what is seen; lamps that clip, the strongest.
+_RAYS, _CANDIDATES, _LEAST_GAIN, _CLIPPED = 64, 8, 10.0, 4
+# Which may shine so many texels of a segment tell, each by rays to few points of every object, then
+# to more of those that bring most, and for radiances from one to the other, next to that with which
+# an object would bring as much as all else.
+_FEW_OF_SEGMENT, _FEW_POINTS, _POINTS, _MANY = 24, 4, 64, 64
+_TRIED = np.geomspace(1 / 8, 64, 10)
 # Nearer points than this share of the scene's size count as that far; what is met before this share
 # of the way hides one; and no segment errs less than by this.
 _NEAREST, _REACHED, _LEAST_OFF = 1e-4, 0.99, 0.01
@@ -199,9 +201,17 @@ def _candidates(
     nothing = np.zeros((len(unseen), 3))
     lamps = _unknown(surface.texels, unseen, nothing, groups, said)
     few = beside_lamps(surface, lit, environment, asked.of(_few_of_segments(asked)), lamps, seed)
-    share = _shares(surface, few, lamps, seed)
-    # Those that clip are among them, lest another stands for their light.
-    best = np.array([k for k in _likeliest(few, share) if k < len(unseen)], np.int64)
+    # Those that clip are among them, lest another stands for their light. Of what is large or near
+    # a few points tell little: what brings most is looked at again, and what was chosen.
+    every = range(len(lamps.mean))
+    roughly = _shares(surface, few, lamps, every, _FEW_POINTS, seed)
+    brightest = np.argsort(-roughly.mean(axis=1), kind="stable")[:_MANY]
+    pool = np.union1d(np.array(_likeliest(few, roughly), np.int64), brightest)
+    share = np.zeros_like(roughly)
+    share[pool] = _shares(surface, few, lamps, pool.tolist(), _POINTS, seed)
+    by_hand = [k for k, number in enumerate(unseen.tolist()) if said.get(number) and share[k].any()]
+    chosen = dict.fromkeys([*by_hand, *_likeliest(few, share)])
+    best = np.array([k for k in chosen if k < len(unseen)][:_CANDIDATES], np.int64)
     usual, rest = np.zeros((len(best), 3)), np.log(few.irradiance)
     for level, own in zip(usual, share[best], strict=True):
         sees = np.flatnonzero(own)
@@ -216,21 +226,25 @@ def _few_of_segments(asked: Asked) -> Bool:
     return np.isin(np.arange(len(asked.texel)), kept)
 
 
-def _shares(surface: TexturedScene, asked: Asked, lamps: Lamps, seed: int) -> Double:
-    """(K, N) W/m^2: what each of the ``lamps`` of radiance 1 brings to the texels asked, by rays to
-    some of its points: it may be as small as it likes, if it is bright."""
+def _shares(
+    surface: TexturedScene, asked: Asked, lamps: Lamps, which: Sequence[int], points: int, seed: int
+) -> Double:
+    """(W, N) W/m^2: what each of the lamps with the numbers ``which`` (W,), of radiance 1, brings
+    to the texels asked, by rays to so many of its points: it may be as small as it likes, if it is
+    bright."""
     texels, random = surface.texels, np.random.default_rng(seed ^ _SEED)
     normal, owner = texels.normal[asked.texel], texels.object_index()
     origin = lift_from_surface(texels.position[asked.texel], normal, surface.diagonal_m)
     shining = np.flatnonzero((lamps.of >= 0) & (texels.area > 0))
     shining = shining[np.argsort(lamps.of[shining], kind="stable")]
     ends = np.searchsorted(lamps.of[shining], np.arange(len(lamps.mean) + 1))
-    brought = np.zeros((len(lamps.mean), len(origin)))
-    for share, start, end in zip(brought, ends[:-1], ends[1:], strict=True):
-        own = shining[start:end]
-        below, number = np.cumsum(texels.area[own], dtype=np.float64), owner[own[:1]]
-        for _ in range(_POINTS if len(own) else 0):
-            point = own[np.searchsorted(below[:-1], below[-1] * random.random(len(origin)))]
+    brought = np.zeros((len(which), len(origin)))
+    for share, number in zip(brought, which, strict=True):
+        own = shining[ends[number] : ends[number + 1]]
+        below, thing = np.cumsum(texels.area[own], dtype=np.float64), owner[own[:1]]
+        for part in range(points if len(own) else 0):
+            at = below[-1] * (part + random.random(len(origin))) / points
+            point = own[np.searchsorted(below[:-1], at)]
             towards = texels.position[point] - origin
             distance = np.maximum(np.linalg.norm(towards, axis=1), _NEAREST * surface.diagonal_m)
             towards = towards / distance[:, None]
@@ -238,9 +252,9 @@ def _shares(surface: TexturedScene, asked: Asked, lamps: Lamps, seed: int) -> Do
             facing = np.maximum(cosines, 0).prod(axis=0)
             sent = np.where(facing[:, None] > 0, towards, 0).astype(np.float32)
             hits = surface.rays.closest(origin, sent)
-            met = (hits.face >= 0) & (surface.scene.face_object[np.maximum(hits.face, 0)] == number)
+            met = (hits.face >= 0) & (surface.scene.face_object[np.maximum(hits.face, 0)] == thing)
             met &= hits.distance > _REACHED * distance
-            share += np.minimum(met * facing * below[-1] / distance**2, np.pi) / _POINTS
+            share += np.minimum(met * facing * below[-1] / distance**2, np.pi) / points
     return brought
 
 
@@ -248,7 +262,7 @@ def _likeliest(asked: Asked, share: Double) -> list[int]:
     """Which sources of share (K, N) make what the texels reflect likelier if they shine, as strong
     as is likeliest, one after the other: the next is the one that adds most to those before it."""
     chosen, light = list[int](), asked.irradiance.mean(axis=1)
-    left = np.flatnonzero(((share > 0) & ~asked.clipped).sum(axis=1) >= LEAST_OF_SEGMENT)
+    left = np.flatnonzero(((share > 0) & ~asked.clipped).sum(axis=1) >= _FEW_OF_SEGMENT // 2)
     while len(left) and len(chosen) < _CANDIDATES:
         found = [_alone(asked, light, share[k]) for k in left]
         gain = np.array([of_one for of_one, _ in found])
@@ -257,7 +271,7 @@ def _likeliest(asked: Asked, share: Double) -> list[int]:
             break
         chosen.append(int(left[best]))
         light = light + found[best][1] * share[left[best]]
-        left = left[np.argsort(-gain, kind="stable")[1:_MANY]]
+        left = np.delete(left, best)
     return chosen
 
 
