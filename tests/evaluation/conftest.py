@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -44,6 +45,12 @@ def make(tmp_path_factory) -> Callable[..., Made]:
         set_quiet(True)
         folder = tmp_path_factory.mktemp("made")
         made = make_capture(folder / "scan", **capture)
+        # They are as bright everywhere, which no light explains.
+        objects = folder / "scan" / "objects.json"
+        document = json.loads(objects.read_text("utf-8"))
+        (walls,) = (item for item in document["objects"] if item["name"] == "walls")
+        walls["directive"] = "not-lamp"
+        objects.write_text(json.dumps(document), "utf-8")
         converted(made.folder, folder / "room", texel_size, ingest)
         return Made(capture=made, asset=folder / "room")
 
