@@ -291,8 +291,8 @@ def test_daylight_is_told_with_what_it_brings_and_how_sure_that_is(room):
     sun = Sun(np.array([0.0, 0.6, 0.8]), np.array([3.0, 2.0, 1.0]))
     light = Environment(np.full((4, 8, 3), 0.5, np.float32), True).under(sun)
     nothing = SimpleNamespace(
-        closest=lambda origins, _: empty_hits(len(origins))._replace(
-            face=np.full(len(origins), -1, np.int32)
+        closest=lambda _, directions: empty_hits(len(directions))._replace(
+            face=np.full(len(directions), -1, np.int32)
         )
     )
     told = daylight(atlas, replace(dark, environment=light, rays=nothing), "none", "Z", 1.0)

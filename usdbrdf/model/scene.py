@@ -19,6 +19,11 @@ class SceneObject:
     num_faces: int
 
     @property
+    def name(self) -> str:
+        """What people call it; of one whose label is blank its identifier."""
+        return self.label.strip() or self.identifier
+
+    @property
     def faces(self) -> slice:
         return slice(self.first_face, self.first_face + self.num_faces)
 

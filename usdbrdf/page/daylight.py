@@ -14,11 +14,10 @@ from usdbrdf.model.arrays import Double, Float, Long
 from usdbrdf.model.material import turned_up
 from usdbrdf.options import ESTIMATE, Surroundings
 from usdbrdf.page.pictures import data_uri
+from usdbrdf.shading.asked import looked_around
 from usdbrdf.transport.environment import Environment, pixels_of_directions
 from usdbrdf.transport.lit_scene import LitScene
-from usdbrdf.transport.rays import lift_from_surface
 from usdbrdf.transport.sunlight import sunlight
-from usdbrdf.transport.warps import cosine_rays
 
 # How many points are asked what reaches them from outside, by how many rays each.
 _POINTS, _RAYS, _SEED = 4096, 64, 0x0DA1
@@ -79,11 +78,9 @@ def _points_evenly(lit: LitScene) -> Long:
 
 def _from_sky(lit: LitScene, index: Long) -> Double:
     """(3,) W/m^2, the mean over texels ``index``."""
-    texels, environment = lit.texels, lit.environment
-    normal = texels.normal[index]
-    origin = lift_from_surface(texels.position[index], normal, lit.diagonal_m)
-    towards = cosine_rays(normal, index, _SEED, _RAYS)
-    out = lit.rays.closest(np.tile(origin, (_RAYS, 1)), towards).face < 0
+    environment = lit.environment
+    towards, face = looked_around(lit, index, _SEED, _RAYS)
+    out = face < 0
     height, width, _ = environment.image.shape
     pixel = pixels_of_directions(towards[out], height, width, environment.z_up)
     arriving = environment.image.reshape(-1, 3)[pixel].sum(axis=0, dtype=np.float64)

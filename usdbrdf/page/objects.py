@@ -84,7 +84,7 @@ def _numbers(atlas: AssetMaps, index: int, obj: SceneObject, fit: FittedObject) 
     base = texels.mean_of_object(index, atlas.map_where_present(colours, 3)) if colours else None
     return {
         "id": obj.identifier,
-        "label": obj.label.strip() or obj.identifier,
+        "label": obj.name,
         "class": obj.class_name,
         "prim": obj.prim_path,
         "status": status,

@@ -131,7 +131,7 @@ def lamps(atlas: AssetMaps, up_axis: str, beside: float = 0.0) -> list[dict[str,
         found.append(
             {
                 "prim": obj.prim_path,
-                "label": obj.label.strip() or obj.identifier,
+                "label": obj.name,
                 "place": [round(float(value), 4) for value in place],
                 "intensity": [float(value) for value in power.sum(axis=0) / 4],
             }

@@ -19,7 +19,7 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
+from usdbrdf.model.arrays import Array, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import asked_texels, first_of_segments, looked_around
@@ -200,7 +200,10 @@ def _candidates(
     that see it, (K, 3): in itself a lamp may be as bright as it is small."""
     nothing = np.zeros((len(unseen), 3))
     lamps = _unknown(surface.texels, unseen, nothing, groups, said)
-    few = beside_lamps(surface, lit, environment, asked.of(_few_of_segments(asked)), lamps, seed)
+    segments = np.arange(int(asked.segment.max()) + 1)
+    each = np.arange(len(asked.texel))
+    some = np.sort(first_of_segments(each, asked.segment, segments, _FEW_OF_SEGMENT))
+    few = beside_lamps(surface, lit, environment, asked.of(some), lamps, seed)
     # Those that clip are among them, lest another stands for their light. Of what is large or near
     # a few points tell little: what brings most is looked at again, and what was chosen.
     every = range(len(lamps.mean))
@@ -217,13 +220,6 @@ def _candidates(
         sees = np.flatnonzero(own)
         level[:] = np.median(rest[sees] - np.log(own[sees])[:, None], axis=0)
     return unseen[best], usual
-
-
-def _few_of_segments(asked: Asked) -> Bool:
-    """(N,): some of the texels asked of each segment."""
-    every = np.arange(int(asked.segment.max()) + 1)
-    kept = first_of_segments(np.arange(len(asked.texel)), asked.segment, every, _FEW_OF_SEGMENT)
-    return np.isin(np.arange(len(asked.texel)), kept)
 
 
 def _shares(
@@ -261,10 +257,13 @@ def _shares(
 def _likeliest(asked: Asked, share: Double) -> list[int]:
     """Which sources of share (K, N) make what the texels reflect likelier if they shine, as strong
     as is likeliest, one after the other: the next is the one that adds most to those before it."""
+    plain = np.flatnonzero(~asked.clipped)
+    asked, share = asked.of(plain), share[:, plain]
+    reflected = np.log(asked.reflected).mean(axis=1)
     chosen, light = list[int](), asked.irradiance.mean(axis=1)
-    left = np.flatnonzero(((share > 0) & ~asked.clipped).sum(axis=1) >= _FEW_OF_SEGMENT // 2)
+    left = np.flatnonzero((share > 0).sum(axis=1) >= _FEW_OF_SEGMENT // 2)
     while len(left) and len(chosen) < _CANDIDATES:
-        found = [_alone(asked, light, share[k]) for k in left]
+        found = [_alone(reflected, asked.segment, light, share[k]) for k in left]
         gain = np.array([of_one for of_one, _ in found])
         best = int(gain.argmax())
         if gain[best] < _LEAST_GAIN:
@@ -275,22 +274,16 @@ def _likeliest(asked: Asked, share: Double) -> list[int]:
     return chosen
 
 
-def _alone(asked: Asked, light: Double, share: Double) -> tuple[float, float]:
+def _alone(reflected: Double, segment: Int, light: Double, share: Double) -> tuple[float, float]:
     """By how much likelier a source of share (N,) beside the ``light`` (N,) makes what the texels
-    reflect, errors being Laplace's, of each segment its own; and the radiance at which it does."""
-    plain = ~asked.clipped
-    segment, number = asked.segment[plain], int(asked.segment.max()) + 1
-    size = np.bincount(segment, minlength=number)
-    reflected, light, share = (
-        np.log(asked.reflected).mean(axis=1)[plain],
-        light[plain],
-        share[plain],
-    )
+    of a ``segment`` (N,) each reflect, a logarithm (N,), errors being Laplace's, of each segment
+    its own; and the radiance at which it does."""
+    size = np.bincount(segment)
 
     def cost(radiance: float) -> float:
         rest = reflected - np.log(light + radiance * share)
-        off = np.abs(rest - medians_of_segments(rest, segment, number)[segment])
-        mean = np.bincount(segment, off, number) / np.maximum(size, 1)
+        off = np.abs(rest - medians_of_segments(rest, segment, len(size))[segment])
+        mean = np.bincount(segment, off) / size
         return float(size @ np.log(np.maximum(mean, _LEAST_OFF)))
 
     usual = float(np.median(light[share > 0] / share[share > 0]))
