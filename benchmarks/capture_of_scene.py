@@ -1,7 +1,7 @@
 """A capture with truth of a scene that somebody else made for Mitsuba (0.6 or 3).
 
     python benchmarks/capture_of_scene.py SCENE.xml OUTPUT [--frames 48] [--views 8] [--width 320]
-        [--samples 48] [--up Y] [--metres-per-unit 1] [--seed 0]
+        [--samples 48] [--up Y] [--metres-per-unit 1] [--within METRES] [--seed 0]
 
 Path traced with the scene's own materials and lights, so independent of this program's BRDF. Frames
 have three exposures in turn, a sensor's noise, 12 bits and saturation, and go through Open Image
@@ -46,6 +46,7 @@ MAX_DEPTH, ROULETTE_FROM = 12, 6
 PASS = 16  # samples per pixel in one call, for memory
 # Where cameras may stand, metres: above what is below them, from any surface, and how they tilt.
 HEIGHTS, CLEARANCE, PITCH = (0.5, 2.0), 0.3, (-50.0, 35.0)
+FROM_AFAR = 2.5  # times how far from where it looks a thing before a backdrop reaches
 PLACES, LOOKS = 300, 8  # candidates: places, and directions from each
 CELL = 0.2  # m: the size of the pieces of surface that are to be seen
 WORTH = np.array([1.0, 0.8, 0.6, 0.15, 0.05])  # of seeing a piece for the first, second ... time
@@ -63,16 +64,23 @@ def main() -> int:
     parser.add_argument("--samples", type=int, default=48, help="paths per pixel of a frame")
     parser.add_argument("--up", choices=("Y", "Z"), default="Y")
     parser.add_argument("--metres-per-unit", type=float, default=1.0)
+    parser.add_argument(
+        "--within",
+        type=float,
+        default=np.inf,
+        help="metres from where the scene's own camera looks: the rest is a backdrop",
+    )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     if options.output.exists():
         parser.error(f"{options.output} exists. Name a folder that does not.")
 
-    scene, eye = load(options.scene)
+    scene, own = load(options.scene)
     things = [*scene.shapes()]
     geometry = world_mesh(things, options.metres_per_unit)
     rays = RayScene(geometry.points, geometry.triangles)
-    cameras = chosen_cameras(rays, eye * options.metres_per_unit, options)
+    own[:3, 3] *= options.metres_per_unit
+    cameras = chosen_cameras(rays, own, options)
     (options.output / "frames").mkdir(parents=True)
     (options.output / "truth").mkdir()
     write_mesh(options.output, geometry)
@@ -93,15 +101,18 @@ class Candidate(NamedTuple):
     pieces: np.ndarray
 
 
-def chosen_cameras(rays: RayScene, eye: Array, options: argparse.Namespace) -> list[Array]:
+def chosen_cameras(rays: RayScene, own: Array, options: argparse.Namespace) -> list[Array]:
     """Poses (4, 4) of the frames, then of the held-out views: greedily what was seen least."""
     rng = np.random.default_rng(options.seed)
     up = np.eye(3)[" YZ".index(options.up)]
+    eye, ahead = own[:3, 3], unit(own[:3, 2])
+    aim = eye + ahead * distances(rays, eye, ahead[None])[0]
     candidates = [
         Candidate(pose, pieces)
         for place in free_places(rays, eye, up, rng)
+        if not np.linalg.norm(place - aim) > FROM_AFAR * options.within
         for pose in looks_from(place, up, rng)
-        if (pieces := pieces_seen(rays, pose, options.width)) is not None
+        if (pieces := pieces_seen(rays, pose, options, aim)) is not None
     ]
     if len(candidates) < 2 * (options.frames + options.views):
         raise SystemExit(f"only {len(candidates)} places to photograph from; is --up right?")
@@ -172,15 +183,18 @@ def looks_from(place: Array, up: Array, rng: np.random.Generator) -> list[Array]
     return poses
 
 
-def pieces_seen(rays: RayScene, pose: Array, width: int) -> np.ndarray | None:
+def pieces_seen(
+    rays: RayScene, pose: Array, options: argparse.Namespace, aim: Array
+) -> np.ndarray | None:
     """Numbers of the pieces of surface before the camera, None if it stands before something."""
-    camera = camera_of(pose, width).at_width(24)
+    camera = camera_of(pose, options.width).at_width(24)
     origins, directions = camera.rays(camera.pixels())
     hits = rays.closest(origins, directions)
     met = hits.face >= 0
     if met.mean() < 0.5 or np.median(hits.distance[met]) < 0.8:
         return None
     points = origins[met] + directions[met] * hits.distance[met, None]
+    points = points[~(np.linalg.norm(points - aim, axis=1) > options.within)]
     cell = np.floor(points / CELL).astype(np.int64) + (1 << 20)
     return np.unique(cell @ np.array([1, 1 << 21, 1 << 42]))
 

@@ -28,7 +28,7 @@ SOLID = {"diffuse", "plastic", "roughplastic", "conductor", "roughconductor"}
 
 
 def load(path: Path) -> tuple[mi.Scene, Double]:
-    """The scene and where its own camera stands, in its units."""
+    """The scene and its own camera's pose (4, 4), in its units; it looks along +z."""
     root = ET.parse(path).getroot()
     for part in root.iter():
         mend_parameters(part)
@@ -40,14 +40,14 @@ def load(path: Path) -> tuple[mi.Scene, Double]:
     sensor = root.find("sensor")
     stand = ET.tostring(sensor.find("transform"), encoding="unicode")
     camera = mi.load_string(f'<sensor version="{version}" type="perspective">{stand}</sensor>')
-    eye = np.array(camera.world_transform().matrix, np.float64).reshape(4, 4)[:3, 3]
+    pose = np.array(camera.world_transform().matrix, np.float64).reshape(4, 4)
     root.remove(sensor)
     text = ET.tostring(root, encoding="unicode")
     for default in root.findall("default"):
         if f"${default.get('name')}" not in text:
             root.remove(default)
     # Not optimised: objects stay apart and in the order of the file.
-    return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False), eye
+    return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False), pose
 
 
 def mend_parameters(part: ET.Element) -> None:
@@ -59,6 +59,9 @@ def mend_parameters(part: ET.Element) -> None:
     for child in list(part):
         if smooth and child.get("name") in ("distribution", "alpha"):
             part.remove(child)
+        elif child.get("name") == "sunRadiusScale":  # of the sun's 0.5358 degrees
+            aperture = 0.5358 * float(child.get("value", "1"))
+            child.attrib.update(name="sun_aperture", value=f"{aperture:.4g}")
         elif child.get("name") == "distribution" and child.get("value") in ("phong", "as"):
             child.set("value", "beckmann")  # 0.6 makes its alpha one of the same width
 
