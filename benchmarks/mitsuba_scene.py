@@ -88,6 +88,10 @@ def mend(folder: Path, parent: ET.Element, child: ET.Element) -> None:
     elif child.tag == "bsdf" and kind in ("phong", "ward"):
         print(f"rough plastic: {kind} {child.get('id', '')}")
         make_plastic(child)
+    elif child.tag == "emitter" and kind in ("sky", "sunsky") and child.find("transform") is None:
+        # Up was y; now it is z, but where the sun stands is said in the world as before.
+        turned = ET.SubElement(child, "transform", name="toWorld")
+        ET.SubElement(turned, "rotate", x="1", angle="-90")
     if child.tag == "bsdf" and child.get("type") in SOLID and parent.tag in ("scene", "shape"):
         inner = ET.Element("bsdf", type=child.get("type", ""))
         inner.extend(list(child))
