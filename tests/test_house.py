@@ -350,6 +350,7 @@ ENGINEERING: dict[str, str] = {
     "_SEED_OF_THROUGH": "random numbers of their own",
     "_SEGMENTS": "time: how many are asked",
     "_SHARE": "memory",
+    "_SHORTEST_PINHOLE": "limit of what is refused",
     "_SIDE": "texels of a tile",
     "_SLACK": "precision against time",
     "_SMALLEST": "pixels that are worked on together",

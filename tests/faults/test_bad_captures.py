@@ -289,6 +289,31 @@ REFUSED: dict[str, tuple[Recipe, str, list[str]]] = {
         "capture.camera",
         ["frames/0000.exr", "k1 10000000000.0", "degrees off its axis", "Correct", "distortion"],
     ),
+    "distortion that stretches": (
+        _manifest(lambda d: d.update(k1=5)),
+        "capture.camera",
+        ["frames/0000.exr", "k1 5.0", "degrees off its axis in the corner"],
+    ),
+    "intrinsics in parts of the picture": (
+        _manifest(lambda d: d.update(fl_x=0.6, fl_y=0.8, cx=0.5, cy=0.5)),
+        "capture.camera",
+        ["frames/0000.exr", "176 degrees wide", "in pixels"],
+    ),
+    "focal length in mm": (
+        _manifest(lambda d: d.update(fl_x=2.4, fl_y=2.4)),
+        "capture.camera",
+        ["frames/0000.exr", "2.4, 2.4, 16, 12", "in pixels, not in mm"],
+    ),
+    "principal point in parts of the picture": (
+        _manifest(lambda d: d.update(cx=0.5, cy=0.5)),
+        "capture.camera",
+        ["frames/0000.exr", "cx and cy are pixels from its corner"],
+    ),
+    "principal point from the middle": (
+        _manifest(lambda d: d.update(cx=0, cy=-0.25)),
+        "capture.camera",
+        ["frames/0000.exr", "not from its middle"],
+    ),
     "distortion that turns back": (
         _manifest(lambda d: d.update(k1=-20)),
         "capture.camera",
@@ -409,6 +434,9 @@ def test_the_capture_is_good_without_a_fault(capture):
 @pytest.mark.fault("C12", "fisheye", "a list as camera model", "distortion")
 @pytest.mark.fault("C12", "distortion that squeezes", "distortion that turns back")
 @pytest.mark.fault("C12", "distortion that moves aside", "panorama of another shape")
+@pytest.mark.fault("C12", "distortion that stretches", "intrinsics in parts of the picture")
+@pytest.mark.fault("C12", "focal length in mm", "principal point in parts of the picture")
+@pytest.mark.fault("C12", "principal point from the middle")
 @pytest.mark.fault("C13", "not json", "deep json", "duplicate key")
 @pytest.mark.fault("G1", "missing mesh", "empty mesh")
 @pytest.mark.fault("G2", "nan vertices", "face index out of range", "negative face index")
