@@ -169,6 +169,17 @@ def test_accents_that_macos_takes_apart_are_the_same(tmp_path):
     assert pictures.mask_of(found, tmp_path, IngestOptions()) is None
 
 
+def test_paths_of_another_machine_tell_pictures_of_one_name_apart(tmp_path):
+    """As Meshroom's and OpenMVG's documents have them."""
+    for folder in ("left", "right"):
+        (tmp_path / "images" / folder).mkdir(parents=True)
+        _write_bytes(tmp_path / "images" / folder / "0001.jpg", np.zeros((2, 2, 3), np.uint8))
+    pictures = pictures_of(tmp_path, IngestOptions())
+    for path in ("C:\\shoot\\right\\0001.jpg", "/home/me/right/0001.png"):
+        assert pictures.named(path) == tmp_path / "images/right/0001.jpg"
+    assert pictures.named("/home/me/0001.jpg") is None
+
+
 @pytest.mark.parametrize("place", ["/home/me/scan/", "C:\\Users\\me\\scan\\", "../fox/"])
 def test_frames_named_where_they_lay_on_another_machine_need_their_folder(made, place):
     _rename(made, place + "frames/{:04d}.exr")

@@ -100,6 +100,9 @@ class Pictures:
             lambda p: p.with_suffix("") == stem,
             lambda p: p.parts[-len(wanted.parts) :] == wanted.parts,
             lambda p: p.with_suffix("").parts[-len(stem.parts) :] == stem.parts,
+            # A path from another machine ends with that below the folder.
+            lambda p: wanted.parts[-len(p.parts) :] == p.parts,
+            lambda p: stem.parts[-len(p.parts) :] == p.with_suffix("").parts,
             lambda p: True,
         )
         candidates = self._by_stem[stem.name]
