@@ -15,7 +15,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from tests.scenes import MadeCapture, edited, make_capture, write_ply
+from tests.scenes import MadeCapture, edited, make_capture, ring_of_poses, write_ply
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.inspection import inspect
 from usdbrdf.errors import InputRefused, UsdBrdfError
@@ -530,6 +530,19 @@ def test_the_convention_that_would_hit_is_named(tmp_path, convention, change):
     assert len(read_scan(capture.folder, IngestOptions()).frames) == 12
     _poses(change)(capture)
     with pytest.raises(InputRefused, match=rf"would hit: {convention}.*: \d\d%"):
+        read_scan(capture.folder, IngestOptions())
+
+
+@pytest.mark.fault("C7")
+def test_a_thing_that_is_small_in_its_pictures_is_no_mix_up(tmp_path):
+    """A box that fills less of them than the limit, and cameras that would look past it."""
+    poses = ring_of_poses(12, radius=3.2, height=1.8)
+    capture = make_capture(tmp_path / "box", room=False, poses=poses)
+    scan = read_scan(capture.folder, IngestOptions())
+    assert len(scan.frames) == 12
+    assert 2 <= scan.counts["rays_hit_percent"] < 20
+    _poses(lambda m: m + np.outer([1, 0, 0, 0], [0, 0, 0, 1.5]))(capture)
+    with pytest.raises(InputRefused, match=r"of the camera rays hit the mesh"):
         read_scan(capture.folder, IngestOptions())
 
 

@@ -103,7 +103,7 @@ def _why_no_camera(record: FrameRecord) -> str:
             f"{said}: it would be {angle:.0f} degrees wide; all are in pixels, not in mm or sizes"
         )
     # That of a picture whose corner is its first pixel is an offset from its middle, or no pixels.
-    if max(map(abs, record.intrinsics[2:])) <= 1:
+    if max(map(abs, record.intrinsics[2:])) <= 1 and 4 * np.abs(centre).max() < 1:
         return f"{said}: cx and cy are pixels from its corner, not from its middle, nor sizes"
     camera = (record.lens, record.intrinsics, record.resolution)
     return why_no_lens(*camera) if views_of(*camera) else said
