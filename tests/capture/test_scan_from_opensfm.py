@@ -138,3 +138,13 @@ def test_shots_without_a_finite_pose_are_left_out(tmp_path):
     part["shots"]["0004.jpg"]["translation"] = [0, None, 0]
     _write(tmp_path, truth(), [part])
     assert len(read_scan(tmp_path, OPTIONS).frames) == 9
+
+
+@pytest.mark.parametrize(("latitude", "told"), [(0.0, 1), (47.1, 0)])
+def test_only_photographs_that_know_their_place_have_a_scale(tmp_path, latitude, told):
+    place = {"latitude": latitude, "longitude": 0.0, "altitude": 0.0}
+    _write(tmp_path, truth(), [_part(truth()) | {"reference_lla": place}])
+    warnings = read_scan(tmp_path, OPTIONS).warnings
+    assert sum("[capture.unit]" in said for said in warnings) == told
+    stated = IngestOptions(assume_srgb=True, meters_per_unit=0.5)
+    assert not any("[capture.unit]" in said for said in read_scan(tmp_path, stated).warnings)

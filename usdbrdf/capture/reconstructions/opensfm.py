@@ -74,7 +74,16 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         meshes=("mesh.*", "odm_texturing/odm_textured_model.obj", "odm_meshing/odm_mesh.ply"),
         how="Put a mesh in the frame of the reconstruction, which georeferenced ones do not have, "
         "into this folder",
+        in_metres=_knows_its_place(largest),
     )
+
+
+def _knows_its_place(part: dict[str, Any]) -> bool:
+    """Whether photographs said where on Earth they were taken, which gives a scale too."""
+    stated = part.get("reference_lla")
+    row = stated if isinstance(stated, dict) else {}
+    place = numbers_among([row.get("latitude"), row.get("longitude")], 2)
+    return place is not None and bool(place.any())
 
 
 def _listed(part: object) -> dict[str, Any]:

@@ -66,6 +66,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         meshes=("raw.glb", "mesh.*"),
         how="Export 'Raw Data' from Polycam with raw.glb, or the mesh as GLTF, into this folder",
         up_axis="Y",
+        in_metres=True,
     )
 
 

@@ -77,6 +77,7 @@ def scan_of_shots(
     meshes: tuple[str, ...],
     how: str,
     up_axis: str | None = None,
+    in_metres: bool = False,
 ) -> Scan:
     """The capture of a document's photographs with the mesh beside them.
 
@@ -85,7 +86,13 @@ def scan_of_shots(
                     them
     meshes, how     patterns of the program's own names, and what to do where there is no mesh
     up_axis         None where the format does not say
+    in_metres       False where the unit is that of the reconstruction, which nobody knows
     """
+    if not in_metres and options.meters_per_unit is None:
+        findings.warn(
+            f"{source.name}: what is reconstructed of photographs alone has no scale; taken are "
+            "metres. State --meters-per-unit. [capture.unit]"
+        )
     pictures = pictures_of(folder, options, *pictures_in)
     refuse_without_pictures(pictures, source)
     records = []
