@@ -194,3 +194,13 @@ def test_a_document_without_version_or_poses_says_so(tmp_path, version):
 def test_a_newer_version_is_read_with_a_warning(tmp_path):
     _write(tmp_path, truth(), _document(truth(), (1, 3, 0)))
     assert any("version 1.3.0 is newer" in said for said in read_scan(tmp_path, OPTIONS).warnings)
+
+
+def test_a_document_in_json_without_features_is_one_too(tmp_path):
+    """As ConvertSfMFormat writes it."""
+    document = _document(truth())
+    del document["featuresFolders"]
+    _write(tmp_path, truth(), document)
+    (tmp_path / "cameras.sfm").rename(tmp_path / "sfm.json")
+    assert choose_adapter(tmp_path / "sfm.json").name == "meshroom"
+    assert len(read_scan(tmp_path, OPTIONS).frames) == 10

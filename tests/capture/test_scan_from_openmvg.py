@@ -67,6 +67,8 @@ def test_pictures_that_were_not_placed_are_left_out(tmp_path):
     room, document = truth().square(), _document(truth().square())
     document["views"][3]["value"]["ptr_wrapper"]["data"]["id_pose"] = NO_POSE
     document["extrinsics"][5]["value"]["center"] = [0, "nan", 0]
+    document["extrinsics"][5]["key"] = []
+    document["views"][5]["value"]["ptr_wrapper"]["data"]["id_pose"] = {}
     _write(tmp_path, room, document)
     assert len(read_scan(tmp_path, OPTIONS).frames) == 8
 

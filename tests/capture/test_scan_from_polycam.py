@@ -81,7 +81,7 @@ def test_without_an_alignment_the_mesh_is_that_of_the_cameras(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "stated", [[1, 2, 3], [0] * 16, "x", np.diag([2, 2, 2, 1]).ravel().tolist()]
+    "stated", [[1, 2, 3], [0] * 16, "x", [1e308] * 16, np.diag([2, 2, 2, 1]).ravel().tolist()]
 )
 def test_an_alignment_that_is_none_is_refused(tmp_path, stated):
     _write(tmp_path, truth())

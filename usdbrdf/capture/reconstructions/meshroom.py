@@ -55,7 +55,8 @@ def matches(path: Path) -> bool:
 def _documents(path: Path) -> list[Path]:
     """Those with poses before others, of Meshroom's own names before others."""
     heads = ((file, beginning_of(file)) for file in files_of(path, [".sfm", ".json"]))
-    found = [f for f, head in heads if f.suffix.lower() == ".sfm" or b'"featuresFolders"' in head]
+    words = (b'"featuresFolders"', b'"viewId"')
+    found = [f for f, head in heads if f.suffix.lower() == ".sfm" or any(w in head for w in words)]
     return sorted(found, key=lambda file: (file.stem != "cameras", file.name))
 
 

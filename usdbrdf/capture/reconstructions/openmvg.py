@@ -67,17 +67,19 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 def shots_of(document: object, source: Path) -> list[Shot]:
     """The photographs of a document."""
     cameras = {
-        row.get("key"): _camera(_data(row), source) for row in rows_of(document, "intrinsics")
+        str(row.get("key")): _camera(_data(row), source) for row in rows_of(document, "intrinsics")
     }
-    poses = {row.get("key"): _pose(row.get("value")) for row in rows_of(document, "extrinsics")}
+    poses = {
+        str(row.get("key")): _pose(row.get("value")) for row in rows_of(document, "extrinsics")
+    }
     found = []
     for view in map(_data, rows_of(document, "views")):
         name = PurePosixPath(str(view.get("local_path", "")), str(view.get("filename", "")))
         found.append(
             Shot(
                 name=name.as_posix(),
-                camera=cameras.get(view.get("id_intrinsic")),
-                world_from_camera=poses.get(view.get("id_pose")),
+                camera=cameras.get(str(view.get("id_intrinsic"))),
+                world_from_camera=poses.get(str(view.get("id_pose"))),
             )
         )
     return found

@@ -16,6 +16,7 @@ from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, scan_of_shots, size_in
+from usdbrdf.capture.rigid_poses import is_camera_matrix
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.tables import numbers_among
@@ -82,7 +83,8 @@ def _alignment(path: Path, findings: Findings) -> Double:
     stated = document.get(_ALIGNMENT) if isinstance(document, dict) else None
     numbers = np.eye(4) if stated is None else numbers_among(stated, 16)
     matrix = None if numbers is None else numbers.reshape(4, 4).T
-    turn = np.zeros((3, 3)) if matrix is None else matrix[:3, :3]
+    sound = matrix is not None and is_camera_matrix(matrix)
+    turn = matrix[:3, :3] if matrix is not None and sound else np.zeros((3, 3))
     if matrix is None or np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3:
         raise InputRefused(
             f"{path}: {_ALIGNMENT} is no rigid matrix of 16 numbers, so nobody knows where the "
