@@ -147,6 +147,13 @@ def test_frames_are_found_by_other_spellings_of_their_names(made, name, files, t
     assert any("[capture.file]" in sentence for sentence in scan.warnings) == told
 
 
+def test_a_jpeg_is_a_jpg_also_beside_others(made):
+    _as_photographs(made, ".jpg")
+    (made.folder / "photographs/0003.jpg").rename(made.folder / "photographs/0003.JPEG")
+    scan = _read(made, assume_srgb=True)
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera)
+
+
 def test_folders_of_other_spellings_are_no_links_and_not_two(made, tmp_path):
     _rename(made, "Frames/{:04d}.exr")
     (made.folder / "FRAMES").mkdir()
