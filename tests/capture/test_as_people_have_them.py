@@ -147,6 +147,13 @@ def test_frames_are_found_by_other_spellings_of_their_names(made, name, files, t
     assert any("[capture.file]" in sentence for sentence in scan.warnings) == told
 
 
+def test_a_jpeg_is_a_jpg_also_beside_others(made):
+    _as_photographs(made, ".jpg")
+    (made.folder / "photographs/0003.jpg").rename(made.folder / "photographs/0003.JPEG")
+    scan = _read(made, assume_srgb=True)
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera)
+
+
 def test_folders_of_other_spellings_are_no_links_and_not_two(made, tmp_path):
     _rename(made, "Frames/{:04d}.exr")
     (made.folder / "FRAMES").mkdir()
@@ -167,6 +174,17 @@ def test_accents_that_macos_takes_apart_are_the_same(tmp_path):
     found = pictures.named("K\u00fcche.jpg")
     assert found == tmp_path / "images" / "Ku\u0308che.jpg"
     assert pictures.mask_of(found, tmp_path, IngestOptions()) is None
+
+
+def test_paths_of_another_machine_tell_pictures_of_one_name_apart(tmp_path):
+    """As Meshroom's and OpenMVG's documents have them."""
+    for folder in ("left", "right"):
+        (tmp_path / "images" / folder).mkdir(parents=True)
+        _write_bytes(tmp_path / "images" / folder / "0001.jpg", np.zeros((2, 2, 3), np.uint8))
+    pictures = pictures_of(tmp_path, IngestOptions())
+    for path in ("C:\\shoot\\right\\0001.jpg", "/home/me/right/0001.png"):
+        assert pictures.named(path) == tmp_path / "images/right/0001.jpg"
+    assert pictures.named("/home/me/0001.jpg") is None
 
 
 @pytest.mark.parametrize("place", ["/home/me/scan/", "C:\\Users\\me\\scan\\", "../fox/"])

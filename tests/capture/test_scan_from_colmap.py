@@ -332,16 +332,21 @@ def _wide(made):
     write_model(made.folder / "sparse/0", reconstruction(made, [camera], names))
 
 
+def _without_poses(made):
+    write_model(made.folder / "sparse/0", pycolmap.Reconstruction())
+
+
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
+        (_without_poses, ["no image of this COLMAP model has a pose", "[colmap.model]"]),
         (_wide, ["1099511627776 x 36 pixels", "[capture.camera]"]),
         (_cut, ["sparse/0", "cannot read this model", "[colmap.model]"]),
         (_outside, ["x.exr", "[paths.outside]"]),
         (lambda made: shutil.rmtree(made.folder / "images"), ["none of", "[colmap.images]"]),
         (lambda made: (made.folder / "mesh.ply").unlink(), ["--mesh", "[mesh.missing]"]),
     ],
-    ids=["wide", "cut off", "outside", "no images", "no mesh"],
+    ids=["no poses", "wide", "cut off", "outside", "no images", "no mesh"],
 )
 def test_what_is_refused(tmp_path, edit, words):
     made = colmap_capture(tmp_path / "room", "PINHOLE")

@@ -338,6 +338,14 @@ def _without_cameras(root):
     root.find("chunk").remove(root.find("chunk/cameras"))
 
 
+def _georeferenced(root):
+    root.find("chunk/transform/translation").text = "4157222.5 664789.3 4774952.1"
+
+
+def _exported_twice(project):
+    (project / "before.xml").write_bytes((project / "cameras.xml").read_bytes())
+
+
 def _entities(project):
     text = (project / "cameras.xml").read_text()
     text = text.replace("?>", '?><!DOCTYPE d [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>', 1)
@@ -355,6 +363,8 @@ def _entities(project):
         (_edit(_cylindrical), r"a 'cylindrical' camera.*\[capture.camera\]"),
         (_edit(_higher_terms), r"'camera 0' has .*higher tangential terms.*\[capture.camera\]"),
         (_edit(_without_cameras), r"no chunk with sensors and cameras.*\[capture.format\]"),
+        (_edit(_georeferenced), r"georeferenced.* 6366 km.*Local Coordinates.*\[capture.pose\]"),
+        (_exported_twice, r"2 exports of cameras.*Name the file.*\[capture.format\]"),
         (_entities, r"document type.*\[document.xml\]"),
     ],
 )
@@ -362,3 +372,8 @@ def test_refusals(project, damage, sentence):
     damage(project)
     with pytest.raises(InputRefused, match=sentence):
         read_scan(project, OPTIONS, "metashape")
+
+
+def test_a_folder_of_two_exports_is_one_of_metashape(project):
+    _exported_twice(project)
+    assert choose_adapter(project).name == "metashape"

@@ -123,9 +123,15 @@ def _no_mesh(scene):
         path.unlink()
 
 
+def _poses_called_otherwise(scene):
+    for file in sorted((scene / "pose").glob("*.txt")):
+        file.rename(file.with_name(f"{int(file.stem):06d}.txt"))
+
+
 @pytest.mark.parametrize(
     ("damage", "sentence"),
     [
+        (_poses_called_otherwise, r"none of its poses is called as a picture.*\[capture.frames\]"),
         (_no_size, r"lens in intrinsic/.* another size than its 32 x 24 pixels.*\[capture.size\]"),
         (_no_lens, r"no lens in intrinsic/intrinsic_color.*reader\.py.*\[capture.camera\]"),
         (_no_mesh, r"Download the scene's \*_vh_clean_2\.ply.*--mesh\. \[mesh.missing\]"),

@@ -72,6 +72,28 @@ def test_intrinsics_from_the_angle_and_from_the_image_header(capture):
     np.testing.assert_allclose(scan.frames.intrinsics[3], capture.intrinsics)
 
 
+def test_angles_may_be_instant_ngps_degrees(capture):
+    with edited(capture.manifest) as document:
+        for key in ("fl_x", "fl_y", "cx", "cy"):
+            del document[key]
+        document["x_fov"] = math.degrees(2 * math.atan(0.5 * 32 / 19.2))
+        document["y_fov"] = math.degrees(2 * math.atan(0.5 * 24 / 19.2))
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.intrinsics[3], capture.intrinsics)
+    with edited(capture.manifest) as document:
+        document["y_fov"] = 190
+    with pytest.raises(InputRefused, match="y_fov is 190, but it is in degrees, below 180"):
+        read_scan(capture.folder, IngestOptions())
+
+
+@pytest.mark.parametrize("model", ["pinhole", "Perspective", "opencv", None])
+def test_camera_models_may_be_written_in_any_letters_or_left_open(capture, model):
+    with edited(capture.manifest) as document:
+        document["camera_model"] = model
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.intrinsics[3], capture.intrinsics)
+
+
 def test_intrinsics_of_a_frame_come_before_those_of_all(capture):
     with edited(capture.manifest) as document:
         document["frames"][4].update(fl_x=21.0, fl_y=22.0, cx=15.0, cy=11.0)

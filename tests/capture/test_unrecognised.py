@@ -14,14 +14,13 @@ from usdbrdf.options import IngestOptions
 DOCUMENTS = [
     ("castle.nvm", "NVM_V3\n\n11\n", "VisualSFM", "COLMAP"),
     ("bundle.rd.out", "# Bundle file v0.3\n2 9\n", "Bundler", "COLMAP"),
-    ("cameras.sfm", '{"version": ["1", "2", "7"], "views": []}', "Meshroom", "ExportColmap"),
-    ("castle.baf", "1\n11\n", "Meshroom", "ExportColmap"),
-    ("sfm_data.json", '{"sfm_data_version": "0.3"}', "OpenMVG", "openMVG2Colmap"),
-    ("renamed.json", '{"sfm_data_version": "0.3"}', "OpenMVG", "openMVG2Colmap"),
-    ("reconstruction.json", '[{"cameras": {}, "shots": {}}]', "OpenSfM", "export_colmap"),
+    ("castle.baf", "1\n11\n", "Meshroom", "cameras.sfm"),
+    ("castle.mg", '{"header": {}}', "Meshroom", "cameras.sfm"),
+    ("sfm_data.bin", "\x00", "OpenMVG", "ConvertSfM_DataFormat"),
+    ("mine.json", '[{"cameras": {}, "shots": {}}]', "OpenSfM", "reconstruction.json"),
     ("trajectory.json", '{"class_name": "PinholeCameraTrajectory"}', "Open3D", "example"),
     ("run.log", "0\t0\t1\n1 0 0 0\n0 1e-3 0 0\n0 -0 1 0\n0 0 0 1\n", "Open3D", "trajectory.json"),
-    ("1234.json", '{"t_00": 1, "fx": 700, "blur_score": 5}', "Polycam", "ns-process-data polycam"),
+    ("1234.json", '{"t_00": 1, "fx": 700, "blur_score": 5}', "Polycam", "holds keyframes/"),
     ("metadata.json", '{"K": [], "poses": []}', "Record3D", "ns-process-data record3d"),
     ("room.r3d", "PK\x03\x04", "Record3D", "fuse the depths into a mesh"),
     ("metadata", '{"K": [], "poses": []}', "Record3D", "ns-process-data record3d"),
@@ -39,6 +38,31 @@ DOCUMENTS = [
     ("room.psx", '<document version="1.2.0"/>', "Metashape", "Export Cameras"),
     ("room.rcproj", "<RealityCaptureProject/>", "RealityScan", "camera parameters"),
     ("scene.mvs", "MVS", "OpenMVS", "COLMAP"),
+    (
+        "at.xml",
+        '<?xml version="1.0"?>\n<BlocksExchange version="2.1">',
+        "ContextCapture",
+        "Agisoft",
+    ),
+    ("opk.txt", "# Label X Y Z Omega Phi Kappa\n", "Metashape", "Export Cameras"),
+    ("a_calibrated_camera_parameters.txt", "fileName imageWidth", "Pix4D", "COLMAP"),
+    ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n", "Stray Scanner", "fuse the"),
+    ("pano-poses.csv", "# pano poses v1.0: ID; filename", "NavVis", "EQUIRECTANGULAR"),
+    ("00000000_cam.txt", "extrinsic\n1 0 0 0\n", "MVSNet", "a transforms.json"),
+    ("metadata_cameras.csv", "camera_name\ncam_00\n", "Hypersim", "a transforms.json"),
+    ("sensors.txt", "# kapture format: 1.1\n", "kapture", "kapture_export_colmap"),
+    ("meta.ini", "# MVE view meta data\n", "MVE", "COLMAP"),
+    ("00000000.txt", "CONTOUR\n1 0 0 0\n", "PMVS", "COLMAP"),
+    ("0000.jpg.camera", "1 0 0\n", "Strecha's benchmark", "a transforms.json"),
+    ("scan_alignment.mlp", "<!DOCTYPE MeshLabDocument>", "MeshLab", "a transforms.json"),
+    ("run.bag", "#ROSBAG V2.0\n", "ROS", "COLMAP"),
+    ("shot.blend", "BLENDER-v400", "Blender", "as USD"),
+    ("shot.hiplc", "070707", "Houdini", "as USD"),
+    ("shot.ma", "//Maya ASCII 2024 scene\n", "Maya", "as USD"),
+    ("shot.c4d", "QC4D", "Cinema 4D", "as USD"),
+    ("shot.chan", "1 0 0 0 0 0 0 50\n", "Nuke", "as USD"),
+    ("bundle.out", "2 9\n1 0 0\n", "Bundler", "COLMAP"),
+    ("database.db", "SQLite format 3\x00", "COLMAP", "colmap mapper"),
 ]
 
 
@@ -93,6 +117,8 @@ def test_cameras_deep_in_a_folder_are_found(tmp_path):
     (tmp_path / "keyframes/cameras").mkdir(parents=True)
     (tmp_path / "keyframes/cameras/12.json").write_text('{"t_00": 1}')
     (tmp_path / "raw.glb").write_bytes(b"")
+    assert "no keyframes/cameras with keyframes/images" in _refused(tmp_path)
+    (tmp_path / "keyframes").rename(tmp_path / "mine")
     assert "12.json holds the cameras of Polycam" in _refused(tmp_path)
 
 
@@ -137,3 +163,24 @@ def test_the_folder_above_a_capture_names_the_one_to_ask_for(tmp_path):
     (tmp_path / "export/scene/transforms.json").write_text("{}")
     said = _refused(tmp_path)
     assert said.startswith(": no capture itself, but export/scene/ in it is one (transforms). Name")
+
+
+def test_a_stage_whose_prims_are_called_as_a_programs_words_is_none_of_its_documents(tmp_path):
+    (tmp_path / "geo.usda").write_text('#usda 1.0\ndef Xform "geo"\n{\n}\n')
+    (tmp_path / "shot.usda").write_text('#usda 1.0\ndef Xform "shots"\n{\n}\n')
+    assert "it holds 2 USD files" in _refused(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["images.bin", "cameras.txt"])
+def test_half_a_colmap_model_is_said_to_be_one(tmp_path, name):
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    (tmp_path / "sparse/0" / name).write_bytes(b"")
+    (tmp_path / "0001.jpg").write_bytes(b"")
+    assert f"it holds {name} of a COLMAP model, which is not whole" in _refused(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras.fbx", "scene.gltf", "scan.glb"])
+def test_cameras_within_a_scene_are_to_be_exported(tmp_path, name):
+    (tmp_path / name).write_bytes(b"")
+    (tmp_path / "0001.jpg").write_bytes(b"")
+    assert "Export them with the mesh as USD, or bring the" in _refused(tmp_path)

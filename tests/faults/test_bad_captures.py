@@ -15,7 +15,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from tests.scenes import MadeCapture, edited, make_capture, write_ply
+from tests.scenes import MadeCapture, edited, make_capture, ring_of_poses, write_ply
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.inspection import inspect
 from usdbrdf.errors import InputRefused, UsdBrdfError
@@ -289,6 +289,31 @@ REFUSED: dict[str, tuple[Recipe, str, list[str]]] = {
         "capture.camera",
         ["frames/0000.exr", "k1 10000000000.0", "degrees off its axis", "Correct", "distortion"],
     ),
+    "distortion that stretches": (
+        _manifest(lambda d: d.update(k1=5)),
+        "capture.camera",
+        ["frames/0000.exr", "k1 5.0", "degrees off its axis in the corner"],
+    ),
+    "intrinsics in parts of the picture": (
+        _manifest(lambda d: d.update(fl_x=0.6, fl_y=0.8, cx=0.5, cy=0.5)),
+        "capture.camera",
+        ["frames/0000.exr", "176 degrees wide", "in pixels"],
+    ),
+    "focal length in mm": (
+        _manifest(lambda d: d.update(fl_x=2.4, fl_y=2.4)),
+        "capture.camera",
+        ["frames/0000.exr", "2.4, 2.4, 16, 12", "in pixels, not in mm"],
+    ),
+    "principal point in parts of the picture": (
+        _manifest(lambda d: d.update(cx=0.5, cy=0.5)),
+        "capture.camera",
+        ["frames/0000.exr", "cx and cy are pixels from its corner"],
+    ),
+    "principal point from the middle": (
+        _manifest(lambda d: d.update(cx=0, cy=-0.25)),
+        "capture.camera",
+        ["frames/0000.exr", "not from its middle"],
+    ),
     "distortion that turns back": (
         _manifest(lambda d: d.update(k1=-20)),
         "capture.camera",
@@ -409,6 +434,9 @@ def test_the_capture_is_good_without_a_fault(capture):
 @pytest.mark.fault("C12", "fisheye", "a list as camera model", "distortion")
 @pytest.mark.fault("C12", "distortion that squeezes", "distortion that turns back")
 @pytest.mark.fault("C12", "distortion that moves aside", "panorama of another shape")
+@pytest.mark.fault("C12", "distortion that stretches", "intrinsics in parts of the picture")
+@pytest.mark.fault("C12", "focal length in mm", "principal point in parts of the picture")
+@pytest.mark.fault("C12", "principal point from the middle")
 @pytest.mark.fault("C13", "not json", "deep json", "duplicate key")
 @pytest.mark.fault("G1", "missing mesh", "empty mesh")
 @pytest.mark.fault("G2", "nan vertices", "face index out of range", "negative face index")
@@ -502,6 +530,19 @@ def test_the_convention_that_would_hit_is_named(tmp_path, convention, change):
     assert len(read_scan(capture.folder, IngestOptions()).frames) == 12
     _poses(change)(capture)
     with pytest.raises(InputRefused, match=rf"would hit: {convention}.*: \d\d%"):
+        read_scan(capture.folder, IngestOptions())
+
+
+@pytest.mark.fault("C7")
+def test_a_thing_that_is_small_in_its_pictures_is_no_mix_up(tmp_path):
+    """A box that fills less of them than the limit, and cameras that would look past it."""
+    poses = ring_of_poses(12, radius=3.2, height=1.8)
+    capture = make_capture(tmp_path / "box", room=False, poses=poses)
+    scan = read_scan(capture.folder, IngestOptions())
+    assert len(scan.frames) == 12
+    assert 2 <= scan.counts["rays_hit_percent"] < 20
+    _poses(lambda m: m + np.outer([1, 0, 0, 0], [0, 0, 0, 1.5]))(capture)
+    with pytest.raises(InputRefused, match=r"of the camera rays hit the mesh"):
         read_scan(capture.folder, IngestOptions())
 
 

@@ -255,12 +255,14 @@ def test_objects_of_an_obj_may_have_faces_of_other_sizes(tmp_path):
     assert mesh.face_label is not None
     found = dict(zip(("three", "four", "five"), ([], [], []), strict=True))
     for label, corners in zip(mesh.face_label.tolist(), mesh.triangles, strict=True):
-        found[mesh.label_names[label]].append(mesh.points[corners, :2].tolist())
-    a, b, c, d, e = [[0, 0], [1, 0], [1, 1], [0, 1], [2, 0.5]]
+        # A triangle is the same from whichever corner on.
+        first = int(np.argmin(corners))
+        found[mesh.label_names[label]].append(np.roll(corners, -first).tolist())
+    a, b, c, d, e = range(5)
     assert found == {
         "three": [[a, b, c]],
-        "four": [[a, b, c], [a, c, d], [d, c, b], [d, b, a]],
-        "five": [[a, b, e], [a, e, c], [a, c, d], [d, c, e], [d, e, b], [d, b, a]],
+        "four": [[a, b, c], [a, c, d], [b, d, c], [a, d, b]],
+        "five": [[a, b, e], [a, e, c], [a, c, d], [c, e, d], [b, d, e], [a, d, b]],
     }
     assert sum(len(surface.triangles) for surface in model_from_file(path)) == 11
 
@@ -410,6 +412,43 @@ def test_obj_faces_with_vertices_before_the_first_are_refused(tmp_path, face):
     (tmp_path / "from_0.obj").write_text(_SQUARE + face + "\n")
     with pytest.raises(InputRefused, match=r"\[mesh\.read\]$"):
         mesh_from_file(tmp_path / "from_0.obj")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "names"),
+    [
+        ("g seat", "g back", {"seat", "back"}),
+        ("g seat\ns off\nusemtl grey", "g back\nusemtl grey", {"seat", "back"}),
+        ("o chair\ng seat", "g back", set()),
+        ("g seat", "s 1", set()),
+    ],
+)
+def test_groups_of_an_obj_without_objects_are_its_objects(tmp_path, first, second, names):
+    path = tmp_path / "chair.obj"
+    path.write_text(f"{_SQUARE}{first}\nf 1 2 3\n{second}\nf 1 3 4\n")
+    mesh = mesh_from_file(path)
+    assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert {*mesh.label_names} == names
+
+
+def test_faces_of_an_obj_stay_in_their_order_whatever_divides_them(tmp_path):
+    """Labels by the number of a face would be another's; here of triangles, quads and a pentagon,
+    of materials that come back and whose names go the other way."""
+    path = tmp_path / "floor.obj"
+    grid = "".join(f"v {i % 6} {i // 6} 0\n" for i in range(12)) + "vt 0 0\nvt 1 1\n"
+    faces = ["1 2 8", "2 3 9 8", "3/1 4/2 10/1", "4 5 6 12 11", "1 8 7", "5 11 10"]
+    materials = ["z", "a", "z", "m", "a", "b"]
+    lines = (f"usemtl {m}\nf {face}\n" for m, face in zip(materials, faces, strict=True))
+    path.write_text(grid + "".join(lines))
+    mesh = mesh_from_file(path)
+    corners = [[int(word.split("/")[0]) - 1 for word in face.split()] for face in faces]
+    expected = [sorted(own) for own in corners for _ in own[2:]]
+    assert mesh.points.tolist() == [[i % 6, i // 6, 0] for i in range(12)]
+    for triangle, own in zip(mesh.triangles.tolist(), expected, strict=True):
+        assert {*triangle} <= {*own}
+    assert mesh.label_names == ("z", "a", "m", "b")
+    assert mesh.face_label is not None
+    assert mesh.face_label.tolist() == [0, 1, 1, 0, 2, 2, 2, 1, 3]
 
 
 def test_obj_keeps_vertices_and_its_objects_become_labels(tmp_path):

@@ -19,6 +19,8 @@ from usdbrdf.transport.rays import RayScene
 
 _MIN_BASELINE = 1e-3  # of the scene's diagonal
 _MIN_HIT_SHARE = 0.2
+# Of a mesh's vertices within a picture, from which on few hits mean that it is far away.
+_MIN_FRAMED_SHARE, _PROBED_POINTS = 0.8, 1000
 _MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
@@ -39,7 +41,8 @@ def refuse_without_parallax(frames: Frames, mesh: ScanMesh, source: Path) -> Non
 
 
 def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> float:
-    """Share of camera rays that hit the mesh; InputRefused below 20 %.
+    """Share of camera rays that hit the mesh; InputRefused below 20 %, unless the mesh is a thing
+    that is small in the pictures, but in the midst of them.
 
     The usual mix-ups of conventions are then tried, and those that would hit are named.
     """
@@ -48,6 +51,8 @@ def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> floa
         return share
     tried = {name: _hit_share(scene, frames, read) for name, read in CONVENTIONS.items()}
     better = [f"{name}: {hit:.0%}" for name, hit in tried.items() if hit >= _MIN_HIT_SHARE]
+    if not better and share > 0 and _framed_share(scene, frames) >= _MIN_FRAMED_SHARE:
+        return share
     if better:
         cure = f"Other readings of the poses would hit: {'; '.join(better)}. Convert the poses"
     else:
@@ -92,6 +97,20 @@ def _probes() -> Double:
     """(P, 2) places in an image, in parts of its sides, at which it is probed with rays."""
     steps = (np.arange(_PROBED_SIDE) + 0.5) / _PROBED_SIDE
     return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+
+
+def _framed_share(scene: RayScene, frames: Frames) -> float:
+    """Share of the vertices that lie within a picture, in the mean over some of the frames."""
+    points = scene.points[spread_evenly(len(scene.points), _PROBED_POINTS)].astype(np.float64)
+    shares = []
+    for i in spread_evenly(len(frames), _PROBED_FRAMES):
+        camera = frames.camera(i)
+        pose = camera.world_from_camera
+        before = points[(points - pose[:3, 3]) @ pose[:3, 2] < 0]
+        pixels = camera.project(before)
+        inside = ((pixels >= 0) & (pixels <= frames.resolution[i])).all(axis=1)
+        shares.append(float(inside.sum()) / len(points))
+    return float(np.mean(shares))
 
 
 def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]) -> float:

@@ -37,5 +37,6 @@ CONVENTIONS: dict[str, Callable[[Double], Double]] = {
     "rotations transposed (transpose them, keep the positions)": _transposed,
     "y-up poses beside a z-up mesh": lambda m: _Z_UP_FROM_Y_UP @ m,
     "z-up poses beside a y-up mesh": lambda m: _Z_UP_FROM_Y_UP.T @ m,
+    "upside down beside the mesh, as Meshroom's are (negate its y and z)": lambda m: _FLIP @ m,
     "nerfstudio's axes of 2022 (state applied_transform)": lambda m: OLD_NERFSTUDIO @ m,
 }

@@ -52,8 +52,9 @@ _STEEPEST = math.radians(80)
 _WORTH_FACES = 2.0
 _KEEPS_DETAIL = 0.9
 # What no photograph's distortion does: leave so much of the picture without directions, squeeze the
-# angle of its border to that share, move the border aside by that share of its distance.
-_LEAST_IMAGED, _LEAST_ANGLE, _MOST_ASIDE = 0.25, 0.25, 0.5
+# angle of its border to that share (of lenses that draw straight to the second: pincushions stretch
+# a picture by a tenth, not to twice its size), move the border aside by that share of its distance.
+_LEAST_IMAGED, _LEAST_ANGLE, _MOST_ASIDE = 0.25, (0.25, 0.6), 0.5
 # Of a sphere's width, by which its height may be off half of it.
 _OFF_SPHERE = 0.01
 # A face narrower than that shows no texel.
@@ -108,7 +109,7 @@ def why_no_lens(lens: Lens, intrinsics: Intrinsics, resolution: Size) -> str:
     angle = float(np.interp(rim, reached, angles))
     plain = np.linspace(0, lens.undistorted.widest_angle, _ANGLES)
     straight = float(np.interp(rim, lens.undistorted.distance(plain), plain))
-    if not angle >= _LEAST_ANGLE * straight:
+    if not angle >= _LEAST_ANGLE[lens.curve == "perspective"] * straight:
         return (
             f"{said}shows {math.degrees(angle):.2g} degrees off its axis in the corner, "
             f"undistorted it would be {math.degrees(straight):.2g}"

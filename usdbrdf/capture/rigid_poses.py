@@ -3,6 +3,7 @@ convention of the whole capture is refused."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,8 @@ _EXACT = 1e-14
 # of the image.
 LARGEST_OF_POSE = 1e9
 _FOCAL_LENGTHS, _FARTHEST_CENTRE = (0.01, 1000.0), 10.0
+# The shortest focal length of a pinhole, in the same: 157 degrees, wider than lenses draw straight.
+_SHORTEST_PINHOLE = 0.1
 
 
 def rigid_records(
@@ -41,13 +44,7 @@ def rigid_records(
             findings.drop(
                 record.name, "its pose is not a finite 4 x 4 camera matrix", "capture.pose"
             )
-        elif not _is_lens(record):
-            lens = ", ".join(f"{number:g}" for number in record.intrinsics)
-            size = " x ".join(map(str, record.resolution))
-            bends = f" with {record.lens.curve} distortion" if record.lens.bends else ""
-            said = f"fx, fy, cx, cy = {lens}{bends} make no lens for {size} pixels"
-            findings.drop(record.name, said, "capture.camera")
-        elif said := why_no_lens(record.lens, record.intrinsics, record.resolution):
+        elif said := _why_no_camera(record):
             findings.drop(record.name, said, "capture.camera")
         else:
             rigid, off = _made_rigid(pose, record.name, source, pose_scale)
@@ -87,14 +84,29 @@ def is_camera_matrix(pose: Double) -> bool:
     )
 
 
-def _is_lens(record: FrameRecord) -> bool:
+def _why_no_camera(record: FrameRecord) -> str:
+    """Why its numbers are not those of a camera of its size, a clause; "" where they may be."""
+    lens = ", ".join(f"{number:g}" for number in record.intrinsics)
+    size = " x ".join(map(str, record.resolution))
+    bends = f" with {record.lens.curve} distortion" if record.lens.bends else ""
+    said = f"fx, fy, cx, cy = {lens}{bends} make no lens for {size} pixels"
     if min(record.resolution) < 1 or max(record.resolution) > MAX_SIDE:
-        return False
+        return said
     focal, centre = np.reshape(record.intrinsics, (2, 2)) / record.resolution
     low, high = _FOCAL_LENGTHS
     near = np.abs(centre) <= _FARTHEST_CENTRE
-    sensible = bool(((focal >= low) & (focal <= high) & near).all())
-    return sensible and len(views_of(record.lens, record.intrinsics, record.resolution)) > 0
+    if not ((focal >= low) & (focal <= high) & near).all():
+        return said
+    if not record.lens.bends and focal.min() < _SHORTEST_PINHOLE:
+        angle = 2 * math.degrees(math.atan(0.5 / focal.min()))
+        return (
+            f"{said}: it would be {angle:.0f} degrees wide; all are in pixels, not in mm or sizes"
+        )
+    # That of a picture whose corner is its first pixel is an offset from its middle, or no pixels.
+    if max(map(abs, record.intrinsics[2:])) <= 1 and 4 * np.abs(centre).max() < 1:
+        return f"{said}: cx and cy are pixels from its corner, not from its middle, nor sizes"
+    camera = (record.lens, record.intrinsics, record.resolution)
+    return why_no_lens(*camera) if views_of(*camera) else said
 
 
 def _refuse_not_rigid(axes: Double, name: str, source: Path, pose_scale: float | None) -> float:

@@ -14,6 +14,9 @@ _STAGES = frozenset((".usd", ".usda", ".usdc", ".usdz"))
 _OF_COLMAP = frozenset(
     f"{part}.{kind}" for part in ("cameras", "images", "points3D") for kind in ("bin", "txt")
 )
+# Whose bytes say nothing of a program; and which may hold cameras, that are not read.
+_NO_DOCUMENTS = _PICTURES | _MESHES | _STAGES
+_SCENES = frozenset((".fbx", ".glb", ".gltf"))
 _MOST_FILES, _HEAD = 10_000, 4096  # looked at in a folder; bytes of a document
 
 
@@ -42,19 +45,19 @@ class _Program(NamedTuple):
 _ANEW = "Reconstruct the same photographs with COLMAP, and name its folder"
 _BY_HAND = "Write a transforms.json of the pictures' poses and lens"
 _EXAMPLE = "the example of an adapter, plugins/example_adapter of our sources"
+_AS_USD = "Export cameras and meshes as USD, and convert that"
 _NOTHING = rb"(?!)"
 _PROGRAMS = (
     _Program(
-        "OpenMVG", (), ("sfm_data",), rb'"sfm_data_version"',
-        "Make a COLMAP model of them with openMVG_main_openMVG2Colmap",
+        "OpenMVG", ("sfm_data.bin", "sfm_data.xml"), (), _NOTHING,
+        "Make a sfm_data.json of them with openMVG_main_ConvertSfM_DataFormat",
     ),
     _Program(
-        "Meshroom", (".sfm", ".mg", ".baf"), (), rb'"featuresFolders"',
-        "Make a COLMAP model of them with its node ExportColmap (aliceVision_exportColmap)",
+        "Meshroom", (".mg", ".baf"), (), _NOTHING,
+        "Name cameras.sfm, which its node StructureFromMotion writes",
     ),
     _Program(
-        "OpenSfM", (), ("reconstruction.json", "reconstruction.meshed.json"), rb'"shots"',
-        "Make a COLMAP model of them with 'opensfm export_colmap'",
+        "OpenSfM", (), (), rb'"shots"', "Call the file reconstruction.json, and name its folder",
     ),
     _Program("Open3D", (), (), rb'"PinholeCameraTrajectory"', f"Read them with {_EXAMPLE}"),
     # Three whole numbers, and a matrix of four rows.
@@ -64,11 +67,10 @@ _PROGRAMS = (
     ),
     _Program("VisualSFM", (".nvm",), (), rb"NVM_V3", _ANEW),
     # What says nothing but .out, its suffix, may be a text of any kind.
-    _Program("Bundler", (), (), rb"# Bundle file", _ANEW),
+    _Program("Bundler", ("bundle.out",), (), rb"# Bundle file", _ANEW),
     _Program(
         "Polycam", (), (), rb'"t_00"',
-        "Make a transforms.json of them with nerfstudio's 'ns-process-data polycam', and a mesh in "
-        "its frame",
+        "Name the whole folder of its raw data, which holds keyframes/, raw.glb and mesh_info.json",
     ),
     _Program(
         "Record3D", (), (), rb'"poses"',
@@ -120,6 +122,51 @@ _PROGRAMS = (
         "Export 'Internal/External camera parameters' (CSV) and the model into one folder",
     ),
     _Program("OpenMVS", (".mvs",), (), _NOTHING, _ANEW),
+    _Program(
+        "ContextCapture", (), (), rb"<BlocksExchange",
+        "From Metashape export them as Agisoft XML, of other programs reconstruct the same "
+        "photographs with COLMAP",
+    ),
+    _Program(
+        "Metashape", (), (), rb"(?mi)^#.*\bomega\b.*\bphi\b.*\bkappa\b",
+        "Export them as Agisoft XML (File > Export > Export Cameras), which has the lens too",
+    ),
+    _Program(
+        "Pix4D",
+        (".p4d", "camera_parameters.txt", "pmatrix.txt"),
+        (), _NOTHING, _ANEW,
+    ),
+    _Program(
+        "Stray Scanner", (), (), rb"\Atimestamp, *frame, *x, *y, *z, *qx",
+        f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+    ),
+    _Program(
+        "NavVis", (), (), rb"\A# *pano poses",
+        f"{_BY_HAND} (EQUIRECTANGULAR), and name the scan's mesh in it",
+    ),
+    _Program("MVSNet", ("_cam.txt",), (), _NOTHING, f"{_BY_HAND}, and name the scene's mesh in it"),
+    _Program(
+        "Hypersim", ("camera_keyframe_positions.hdf5", "metadata_cameras.csv"), (), _NOTHING,
+        f"{_BY_HAND}, and name the scene's mesh in it",
+    ),
+    _Program(
+        "kapture", (), (), rb"\A# *kapture format",
+        "Make a COLMAP model of them with kapture_export_colmap.py",
+    ),
+    _Program("MVE", (), (), rb"\A# *MVE view meta data", _ANEW, "meta.ini"),
+    _Program("PMVS", (), (), rb"\ACONTOUR", _ANEW),
+    _Program("Strecha's benchmark", (".camera",), (), _NOTHING, _BY_HAND),
+    _Program("MeshLab", (".mlp",), (), _NOTHING, _BY_HAND),
+    _Program("ROS", (".bag", ".mcap"), (), _NOTHING, f"Extract the photographs. {_ANEW}"),
+    _Program("Blender", (".blend",), (), _NOTHING, _AS_USD),
+    _Program("Houdini", (".hip", ".hiplc", ".hipnc"), (), _NOTHING, _AS_USD),
+    _Program("Maya", (".ma", ".mb"), (), _NOTHING, _AS_USD),
+    _Program("Cinema 4D", (".c4d",), (), _NOTHING, _AS_USD),
+    _Program("Nuke", (".nk", ".chan"), (), _NOTHING, f"Import them into Blender. {_AS_USD}"),
+    _Program(
+        "COLMAP", (), (), rb"\ASQLite format 3",
+        "This database has no poses: have them found with 'colmap mapper'", "database.db",
+    ),
 )  # fmt: skip
 
 
@@ -148,8 +195,14 @@ def what_lies_there(path: Path) -> str:
         largest = max(parts, key=lambda file: file.stat().st_size)
         return f"{largest.name} holds the cameras of some of its pictures. Name that file"
     for file in files:
-        if file.suffix.lower() not in _PICTURES | _MESHES and (said := other_program(file)):
+        if file.suffix.lower() not in _NO_DOCUMENTS and (said := other_program(file)):
             return said
+    halves = [file.name for file in files if file.name in _OF_COLMAP]
+    if halves:
+        return (
+            f"it holds {', '.join(halves[:3])} of a COLMAP model, which is not whole without "
+            "cameras and images of one kind (.bin or .txt). Export it again"
+        )
     stages = [file for file in files if file.suffix.lower() in _STAGES and file.parent == path]
     if len(stages) > 1:
         return (
@@ -165,7 +218,9 @@ def what_lies_there(path: Path) -> str:
     if not held:
         return "it holds neither pictures nor cameras. Name the folder that holds the capture"
     how = (
-        "Bring the document that the scanning program writes of its cameras"
+        "Export them with the mesh as USD, or bring the scanning program's document of its cameras"
+        if any(mesh.suffix.lower() in _SCENES for mesh in meshes)
+        else "Bring the document that the scanning program writes of its cameras"
         if meshes
         else "Have them found (COLMAP, Metashape, RealityScan), and name the folder that holds both"
     )

@@ -182,6 +182,16 @@ def numbers_of(element: Element | None, count: int) -> Double | None:
     return values if len(values) == count and np.isfinite(values).all() else None
 
 
+def numbers_among(value: object, count: int) -> Double | None:
+    """A value of a JSON document, lists or not, as ``count`` finite numbers, which may be written
+    as texts; None where it holds anything else."""
+    try:
+        values = np.array(value, np.float64).ravel()
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return values if len(values) == count and np.isfinite(values).all() else None
+
+
 def number_in(row: Mapping[str, str | None], *names: str) -> float | None:
     """The number under the first of ``names`` that a row of text has; None where it is none."""
     text = next((row[name] for name in names if row.get(name)), None)

@@ -98,7 +98,7 @@ def agreement_of_frames(
     found = under(CONVENTIONS)
     better = found.get(name := other_convention(given, found))
     if better is not None:
-        differ = f"differ by {given.ratio:.0%} of what any two pixels do" if given else "cannot"
+        differ = f"differ by {given.ratio:.0%} of what any two pixels do" if given else "share none"
         raise InputRefused(
             f"{source}: the frames do not show the same things at the same points of the mesh "
             f"({differ}); with the poses read as {name} they would differ by {better.ratio:.0%}. "

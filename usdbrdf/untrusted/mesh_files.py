@@ -44,7 +44,7 @@ from usdbrdf.untrusted.mesh_gltf import (
     with_numbered_materials,
 )
 from usdbrdf.untrusted.mesh_ply import ply_of
-from usdbrdf.untrusted.mesh_text import missing_vertex, obj_of_convex_faces, plain_obj
+from usdbrdf.untrusted.mesh_text import missing_vertex, obj_of_convex_faces, parts_of_obj, plain_obj
 
 SUFFIXES = (".ply", ".obj", ".glb")
 # The face property by which the objects of a segmented PLY are told apart.
@@ -203,20 +203,21 @@ def _mesh_from_ply(file: BinaryIO) -> FileMesh:
 def _mesh_from_obj(file: BinaryIO) -> FileMesh:
     content = plain_obj(file.read())
     try:
-        loaded: dict[str, Any] = load_obj(
-            BytesIO(obj_of_convex_faces(content)),
-            skip_materials=True,
-            maintain_order=True,
-            split_objects=True,
-        )
+        whole, names, part = parts_of_obj(obj_of_convex_faces(content))
+        loaded: dict[str, Any] = load_obj(BytesIO(whole), skip_materials=True, maintain_order=True)
     except IndexError as error:
         if said := missing_vertex(content):
             raise InputRefused(
                 f"{file.name}: {said}. Export it again, or correct this line. [mesh.index]"
             ) from error
         raise
-    parts = loaded.get("geometry", {})
-    return _joined([(name, p["vertices"], _fans(p["faces"])) for name, p in parts.items()])
+    if not (found := [*loaded.get("geometry", {}).values()]):
+        return _no_faces(0)
+    faces = _fans(found[0]["faces"])
+    if len(found) > 1 or len(faces) != len(part):
+        raise ValueError(f"{len(part)} triangles are stated, {len(faces)} found")
+    label = part if len(names) > 1 else None
+    return _file_mesh(found[0]["vertices"], faces, label, names if len(names) > 1 else ())
 
 
 def _fans(faces: Any) -> Any:

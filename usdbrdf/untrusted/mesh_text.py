@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import codecs
 import re
+from collections import Counter
 
 import numpy as np
 
+from usdbrdf.model.arrays import Long
 from usdbrdf.model.mesh import triangulate
 from usdbrdf.model.polygons import ears, fans_that_leave
 
@@ -15,6 +17,8 @@ _BACKWARDS = re.compile(rb"^f [^\n]*[ ]-\d", re.MULTILINE)
 _NOUGHT = re.compile(rb"^f (?:[^\n]*[ ])?0+[/ \n]", re.MULTILINE)
 _REMARK = re.compile(rb"^([ ]*(?:v[tn]?|f) [^\n#]*)#[^\n]*", re.MULTILINE)
 _POLYGON = re.compile(rb"^f(?: +[^ \n]+){4}", re.MULTILINE)
+_LARGE = re.compile(rb"^f(?: +[^ \n]+){4,}", re.MULTILINE)
+_DIVIDER = re.compile(rb"^(o|g|usemtl)(?= |$)([^\n]*)", re.MULTILINE)
 # A line that goes on in the next, as often as it does.
 _CONTINUED = re.compile(rb"^(?:[^\n]*\\\n)+[^\n]*", re.MULTILINE)
 
@@ -104,6 +108,45 @@ def obj_of_convex_faces(content: bytes) -> bytes:
             for ear in ears(points[own]).tolist()
         )
     return b"\n".join(lines)
+
+
+def parts_of_obj(content: bytes) -> tuple[bytes, tuple[str, ...], Long]:
+    """A plain OBJ without the lines that divide it; the names of its parts; and the part (T,) of
+    each triangle that its faces become, in their order, in which trimesh would not leave them.
+
+    Parts are objects, groups where there are none, each divided by its materials; they are numbered
+    as they appear.
+    """
+    found = [*_DIVIDER.finditer(content)]
+    outer = b"o" if any(line[1] == b"o" for line in found) else b"g"
+    state = {b"o": b"", b"g": b"", b"usemtl": b""}
+    number: dict[tuple[bytes, bytes], int] = {}
+    part, counts = [], []
+    ends = [*(line.start() for line in found), len(content)]
+    for end, line in zip(ends, [None, *found], strict=True):
+        if line is not None:
+            state[line[1]] = line[2].strip()
+        if count := _triangles_between(content, line.end() if line else 0, end):
+            part.append(number.setdefault((state[outer], state[b"usemtl"]), len(number)))
+            counts.append(count)
+    of_triangle = np.repeat(np.array(part, np.int64), counts)
+    return _DIVIDER.sub(b"", content) if found else content, _names(list(number)), of_triangle
+
+
+def _triangles_between(content: bytes, start: int, end: int) -> int:
+    more = (len(face[0].split()) - 4 for face in _LARGE.finditer(content, start, end))
+    return content.startswith(b"f ", start) + content.count(b"\nf ", start, end) + sum(more)
+
+
+def _names(parts: list[tuple[bytes, bytes]]) -> tuple[str, ...]:
+    """Of objects or groups with their materials: the first, and both where it has several."""
+    several = Counter(outer for outer, _ in parts)
+    words = (
+        (outer, material) if several[outer] > 1 or not outer else (outer,)
+        for outer, material in parts
+    )
+    texts = ("_".join(w.decode("utf-8", "replace") for w in two if w) for two in words)
+    return tuple(text or "unnamed" for text in texts)
 
 
 def missing_vertex(content: bytes) -> str:

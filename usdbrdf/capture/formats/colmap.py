@@ -163,10 +163,12 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
     workspaces = _workspaces(path)
     pictured = Pictured(folder=path, options=options)
     candidates: list[_Chosen] = []
+    named = 0
     for workspace in workspaces:
         model = colmap_model(workspace.model)
         if not model.names:
             continue
+        named += 1
         counts = [
             sum(pictured.of(name, f) is not None for name in model.names) for f in workspace.images
         ]
@@ -177,6 +179,12 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
         where = f"{path}: none of the images that the COLMAP model names is there"
         if not workspaces:
             where = f"{path}: no COLMAP model (cameras and images, .bin or .txt)"
+        elif not named:
+            raise InputRefused(
+                f"{workspaces[0].model}: no image of this COLMAP model has a pose. Have them found "
+                "with 'colmap mapper', and name the folder that holds what it writes. "
+                "[colmap.model]"
+            )
         raise InputRefused(
             f"{where}. Put the model in sparse/0 and the images in images/, or name their folder "
             "with --frames. [colmap.images]"

@@ -78,6 +78,11 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             )
         )
     warn_of_radiance(pictures.instead, findings, source)
+    if options.meters_per_unit is None:
+        findings.warn(
+            f"{source.name}: its poses have no scale; taken are metres. State --meters-per-unit. "
+            "[capture.unit]"
+        )
     mesh = partial(
         mesh_beside,
         folder,

@@ -44,11 +44,13 @@ _CURVES: dict[str, Curve] = {
     "fisheye": "fisheye",
     "equidistant_fisheye": "fisheye",
 }
+# From the Earth's middle, in metres: nothing stands so far from the origin of its own coordinates.
+_GEOCENTRIC = 1e6
 
 
 def matches(path: Path) -> bool:
-    """An XML document with sensors and cameras, or a folder with one of them."""
-    return len(_documents(path)) == 1
+    """An XML document with sensors and cameras, or a folder with such."""
+    return bool(_documents(path))
 
 
 def _documents(path: Path) -> list[Path]:
@@ -212,12 +214,24 @@ def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Eleme
     own = _place(chunk.find("transform"))
     parts = chunk.iterfind("components/component")
     components = {part.get("id", ""): _place(part.find("transform")) for part in parts}
+    far = max((_distance(place) for place in (own, *components.values()) if place), default=0.0)
+    if far > _GEOCENTRIC:
+        raise InputRefused(
+            f"{source}: the chunk is georeferenced: its transform leads {far / 1000:.0f} km away, "
+            "to geocentric coordinates, in which no model is exported. Make its coordinate system "
+            "Local Coordinates (Reference > Settings), update the transform, and export cameras "
+            "and model again. [capture.pose]"
+        )
     if own is None and not any(components.values()):
         findings.warn(
             f"{source.name}: the chunk has no transform, so its unit is arbitrary. State "
             "--meters-per-unit. [capture.unit]"
         )
     return lambda camera: own or components.get(camera.get("component_id", "")) or _UNPLACED
+
+
+def _distance(place: _Place) -> float:
+    return float(np.linalg.norm(place.translation))
 
 
 _UNPLACED = _Place(rotation=np.eye(3), translation=np.zeros(3), scale=1.0)

@@ -100,6 +100,9 @@ class Pictures:
             lambda p: p.with_suffix("") == stem,
             lambda p: p.parts[-len(wanted.parts) :] == wanted.parts,
             lambda p: p.with_suffix("").parts[-len(stem.parts) :] == stem.parts,
+            # A path from another machine ends with that below the folder.
+            lambda p: wanted.parts[-len(p.parts) :] == p.parts,
+            lambda p: stem.parts[-len(p.parts) :] == p.with_suffix("").parts,
             lambda p: True,
         )
         candidates = self._by_stem[stem.name]
@@ -277,10 +280,10 @@ class Pictured:
         alike = next((beside[stem] for stem in names if stem in beside), [])
         if path.is_file() and not (alike and path.suffix.lower() in _HEIF):
             return _or_radiance(path, alike, self.instead)
-        suffix = path.suffix.lower()
-        if any(one.suffix.lower() == suffix for found in beside.values() for one in found):
+        kind = _kind_of_file(path)
+        if any(_kind_of_file(one) == kind for found in beside.values() for one in found):
             # Where some are of the kind that is named, what is of another may be their depths.
-            alike = [one for one in alike if one.suffix.lower() == suffix or _is_radiance(one)]
+            alike = [one for one in alike if _kind_of_file(one) == kind or _is_radiance(one)]
         nearest = nearest_to_radiance(alike)
         if nearest and _composed(path.name) not in map(_composed, (nearest.name, nearest.stem)):
             self.otherwise[name] = nearest
@@ -319,6 +322,10 @@ class Pictured:
         # No links: they may lead out.
         alike = [p for p in there if _composed(p.name).lower() == name and not p.is_symlink()]
         return alike[0] if len(alike) == 1 and alike[0].is_dir() else folder
+
+
+def _kind_of_file(path: Path) -> str:
+    return {".jpeg": ".jpg", ".tiff": ".tif"}.get(kind := path.suffix.lower(), kind)
 
 
 def _names_without_suffix(name: str) -> tuple[str, ...]:

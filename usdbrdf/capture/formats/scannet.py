@@ -97,6 +97,11 @@ def read(path: Path, options: CaptureOptions) -> Scan:
                 size_of_image=camera.resolution is None,
             )
         )
+    if not records and findings.counts.get("poses_without_photograph"):
+        raise InputRefused(
+            f"{source}: none of its poses is called as a picture in {pictures.folder.name}, first "
+            f"of which is {pictures.paths[0].name!r}. {_UNPACK} again. [capture.frames]"
+        )
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
     how = f"Download the scene's *{_MESH}"
     mesh = partial(mesh_beside, folder, options, f"*{_MESH}", "*_vh_clean.ply", how=how)

@@ -305,8 +305,8 @@ def _intrinsics(
 ) -> tuple[float, float, float, float]:
     if lens.curve == "equirectangular":
         return whole_sphere(width, height)
-    fx = capture.positive(frame, "fl_x") or _of_angle(capture, frame, "camera_angle_x", width)
-    fy = capture.positive(frame, "fl_y") or _of_angle(capture, frame, "camera_angle_y", height)
+    fx = capture.positive(frame, "fl_x") or _of_angles(capture, frame, "x", width)
+    fy = capture.positive(frame, "fl_y") or _of_angles(capture, frame, "y", height)
     if fx is None:
         raise capture.refuse(
             f"the frame {name!r} has neither fl_x nor camera_angle_x. State the focal length in "
@@ -317,17 +317,24 @@ def _intrinsics(
     return fx, fy or fx, width / 2 if cx is None else cx, height / 2 if cy is None else cy
 
 
-def _of_angle(capture: _Capture, frame: Mapping[str, Any], key: str, size: float) -> float | None:
-    """The focal length in pixels of an image that is as wide as an angle, None without one."""
-    angle = capture.positive(frame, key)
-    if angle is not None and angle >= math.pi:
-        # Its tangent may be that of another angle altogether.
-        raise capture.refuse(
-            f"{key} is {angle:g}, but it is in radians, below {math.pi:.4g}. Correct it, or state "
-            "the focal length in pixels.",
-            "capture.camera",
-        )
-    return None if angle is None else size / (2 * math.tan(angle / 2))
+def _of_angles(capture: _Capture, frame: Mapping[str, Any], axis: str, size: float) -> float | None:
+    """The focal length in pixels of an image that is as wide as an angle, of the two that documents
+    have for it, the second instant-ngp's; None without either."""
+    for key, half_turn, unit in (
+        (f"camera_angle_{axis}", math.pi, "radians"),
+        (f"{axis}_fov", 180.0, "degrees"),
+    ):
+        angle = capture.positive(frame, key)
+        if angle is not None and angle >= half_turn:
+            # Its tangent may be that of another angle altogether.
+            raise capture.refuse(
+                f"{key} is {angle:g}, but it is in {unit}, below {half_turn:.4g}. Correct it, or "
+                "state the focal length in pixels.",
+                "capture.camera",
+            )
+        if angle is not None:
+            return size / (2 * math.tan(angle / half_turn * math.pi / 2))
+    return None
 
 
 def _why_of_another_size(
@@ -380,10 +387,11 @@ def _lens(capture: _Capture, frame: Mapping[str, Any], name: str) -> Lens:
     """
     fisheye = frame.get("is_fisheye", capture.document.get("is_fisheye"))
     usual = "OPENCV_FISHEYE" if fisheye is True else "PINHOLE"
-    model = frame.get("camera_model", capture.document.get("camera_model", usual))
+    stated = frame.get("camera_model", capture.document.get("camera_model"))
+    model = usual if stated is None else stated.upper() if isinstance(stated, str) else stated
     if not isinstance(model, str) or model not in _CURVES:
         raise capture.refuse(
-            f"the frame {name!r} has the camera model {model!r} (known: {', '.join(_CURVES)}). "
+            f"the frame {name!r} has the camera model {stated!r} (known: {', '.join(_CURVES)}). "
             "Undistort the images to a pinhole camera first.",
             "capture.camera",
         )

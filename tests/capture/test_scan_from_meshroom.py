@@ -1,0 +1,206 @@
+"""Meshroom's cameras.sfm, written after AliceVision's own writer (sfmDataIO/jsonIO.cpp), in the
+dialects of its versions."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
+from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.reconstructions.meshroom import shots_of
+from usdbrdf.errors import InputRefused
+from usdbrdf.options import IngestOptions
+
+OPTIONS = IngestOptions(assume_srgb=True)
+SENSOR_MM = 23.5
+# A mesh of today's lies in OpenGL's frame: y and z of the cameras' world, negated.
+OPENGL = np.array([1.0, -1.0, -1.0])
+
+
+def _texts(values):
+    return [repr(float(value)) for value in np.ravel(values, order="F")]
+
+
+def _camera(room, version):
+    fx, fy, cx, cy = room.intrinsics[0]
+    offset = (WIDTH / 2, HEIGHT / 2) if version >= (1, 2, 1) else (0, 0)
+    row = {
+        "intrinsicId": "7",
+        "width": str(WIDTH),
+        "height": str(HEIGHT),
+        "serialNumber": "x",
+        "principalPoint": _texts([cx - offset[0], cy - offset[1]]),
+        "type": "pinhole" if version >= (1, 2, 8) else "radial3",
+        "distortionParams": ["0", "0", "0"],
+        "locked": "false",
+    }
+    if version >= (1, 2, 8):
+        row |= {"distortionType": "radialk3", "undistortionType": "none"}
+    if version < (1, 2, 0):
+        return row | {"pxFocalLength": repr(float(fx))}
+    if version < (1, 2, 2):
+        return row | {"pxFocalLength": _texts([fx, fy])}
+    row |= {"sensorWidth": repr(SENSOR_MM), "sensorHeight": "15.6"}
+    if version >= (1, 2, 11):
+        focal, ratio = fy, fy / fx
+    else:
+        focal, ratio = fx, (fy / fx if version >= (1, 2, 5) else fx / fy)
+    return row | {
+        "focalLength": repr(float(focal / WIDTH * SENSOR_MM)),
+        "pixelRatio": repr(float(ratio)),
+    }
+
+
+def _document(room, version=(1, 2, 11)):
+    views, poses = [], []
+    for i, pose in enumerate(room.opencv):
+        number = {"viewId": str(100 + i), "poseId": str(200 + i), "intrinsicId": "7"}
+        path = f"C:/photos/{i % 2}/{i // 2:04d}.jpg"
+        views.append(number | {"path": path, "width": str(WIDTH), "height": str(HEIGHT)})
+        transform = {"rotation": _texts(pose[:3, :3].T), "center": _texts(pose[:3, 3])}
+        held = {"transform": transform, "locked": "0"}
+        poses.append({"poseId": str(200 + i), "pose": held})
+    return {
+        "version": [str(number) for number in version],
+        "featuresFolders": ["../FeatureExtraction"],
+        "views": views,
+        "intrinsics": [_camera(room, version)],
+        "poses": poses,
+    }
+
+
+def _write(folder, room, document, *, turned=True):
+    for i, image in enumerate(room.images):
+        write_image(folder / "images" / str(i % 2) / f"{i // 2:04d}.jpg", image)
+    write_obj(folder / "texturedMesh.obj", room, room.points * (OPENGL if turned else 1))
+    (folder / "cameras.sfm").write_text(json.dumps(document))
+    return folder
+
+
+def _order():
+    """Frames in the order of their pictures' paths."""
+    return [*range(0, 10, 2), *range(1, 10, 2)]
+
+
+@pytest.mark.parametrize("version", [(1, 2, n) for n in (0, 1, 2, 3, 5, 8, 11)] + [(1, 0, 0)])
+def test_every_version_is_the_room(tmp_path, version):
+    room = truth().square() if version < (1, 2) else truth()
+    turned = version >= (1, 2, 3)
+    _write(tmp_path, room, _document(room, version), turned=turned)
+    assert choose_adapter(tmp_path).name == choose_adapter(tmp_path / "cameras.sfm").name
+    scan = read_scan(tmp_path, OPTIONS)
+    flip = np.diag([*OPENGL, 1.0]) if turned else np.eye(4)
+    poses = flip @ room.world_from_camera[_order()]
+    points = room.points * (OPENGL if turned else 1)
+    assert_same(scan, room, points=points, poses=poses, names=room.names)
+    assert scan.adapter == "meshroom"
+
+
+def _brown(plane, terms):
+    """As DistortionBrown.cpp writes it."""
+    (x, y), (k1, k2, k3, t1, t2) = plane, terms
+    r2 = x * x + y * y
+    radial = k1 * r2 + k2 * r2**2 + k3 * r2**3
+    return (
+        x + x * radial + t2 * (r2 + 2 * x * x) + 2 * t1 * x * y,
+        y + y * radial + t1 * (r2 + 2 * y * y) + 2 * t2 * x * y,
+    )
+
+
+def _fisheye(plane, terms):
+    """As DistortionFisheye.cpp writes it."""
+    r = np.hypot(*plane)
+    theta = np.arctan(r)
+    bent = theta + sum(k * theta ** (2 * i + 3) for i, k in enumerate(terms))
+    return plane[0] * bent / r, plane[1] * bent / r
+
+
+def _fov(plane, terms):
+    r = np.hypot(*plane)
+    bent = np.arctan(2 * r * np.tan(terms[0] / 2)) / terms[0]
+    return plane[0] * bent / r, plane[1] * bent / r
+
+
+def _radial(plane, terms):
+    r2 = plane[0] ** 2 + plane[1] ** 2
+    return tuple(p * (1 + sum(k * r2 ** (i + 1) for i, k in enumerate(terms))) for p in plane)
+
+
+@pytest.mark.parametrize(
+    ("kind", "terms", "bend"),
+    [
+        ("radialk1", [-0.1], _radial),
+        ("radialk3", [-0.1, 0.02, 0.01], _radial),
+        ("brown", [-0.1, 0.02, 0.01, 0.004, -0.003], _brown),
+        ("fisheye", [0.02, -0.01, 0.003, -0.001], _fisheye),
+        ("fisheye1", [0.9], _fov),
+        ("none", [], lambda plane, terms: plane),
+    ],
+)
+def test_distortions_are_those_of_alicevision(tmp_path, kind, terms, bend):
+    room, document = truth(), _document(truth())
+    document["intrinsics"][0] |= {"distortionType": kind, "distortionParams": _texts(terms)}
+    camera = shots_of(document, (1, 2, 11), tmp_path)[0].camera
+    assert camera is not None
+    plane = (0.31, -0.23)
+    pixel = camera.lens.project(np.array([plane[0], -plane[1], -1.0]), camera.intrinsics)
+    fx, fy, cx, cy = room.intrinsics[0]
+    x, y = bend(plane, terms)
+    np.testing.assert_allclose(pixel, [cx + fx * x, cy + fy * y], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"type": "equidistant"}, ["'equidistant' is not read", "CameraInit", "capture.camera"]),
+        ({"undistortionType": "3deanamorphic4"}, ["3deanamorphic4", "capture.camera"]),
+        ({"focalLength": "0"}, ["it has no camera", "capture.alignment"]),
+        ({"width": "-4"}, ["it has no camera", "capture.alignment"]),
+    ],
+)
+def test_cameras_that_are_not_read_are_named(tmp_path, change, words):
+    room, document = truth(), _document(truth())
+    document["intrinsics"][0] |= change
+    _write(tmp_path, room, document)
+    with pytest.raises(InputRefused) as refused:
+        read_scan(tmp_path, OPTIONS)
+    assert [word for word in words if word not in str(refused.value)] == []
+
+
+def test_views_of_a_rig_and_without_a_pose_are_left_out(tmp_path):
+    room, document = truth(), _document(truth())
+    document["views"][2] |= {"rigId": "5", "subPoseId": "0", "isPoseIndependant": "false"}
+    del document["poses"][4]
+    _write(tmp_path, room, document)
+    scan = read_scan(tmp_path, OPTIONS)
+    assert len(scan.frames) == 8
+    assert any("it is one of a rig" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize("version", [None, ["1", "x", "0"], "1.2.11"])
+def test_a_document_without_version_or_poses_says_so(tmp_path, version):
+    document = _document(truth())
+    _write(tmp_path, truth(), document | {"version": version})
+    with pytest.raises(InputRefused, match="no version"):
+        read_scan(tmp_path, OPTIONS)
+    _write(tmp_path, truth(), document | {"poses": []})
+    with pytest.raises(InputRefused, match="no poses of cameras"):
+        read_scan(tmp_path, OPTIONS)
+
+
+def test_a_newer_version_is_read_with_a_warning(tmp_path):
+    _write(tmp_path, truth(), _document(truth(), (1, 3, 0)))
+    assert any("version 1.3.0 is newer" in said for said in read_scan(tmp_path, OPTIONS).warnings)
+
+
+def test_a_document_in_json_without_features_is_one_too(tmp_path):
+    """As ConvertSfMFormat writes it."""
+    document = _document(truth())
+    del document["featuresFolders"]
+    _write(tmp_path, truth(), document)
+    (tmp_path / "cameras.sfm").rename(tmp_path / "sfm.json")
+    assert choose_adapter(tmp_path / "sfm.json").name == "meshroom"
+    assert len(read_scan(tmp_path, OPTIONS).frames) == 10

@@ -1,0 +1,131 @@
+"""What the documents of programs that reconstruct photographs have in common: each photograph has a
+camera and a pose by numbers, pictures lie in some folder, and a mesh that was exported beside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.conventions import opengl_from_opencv
+from usdbrdf.capture.formats.named_pictures import (
+    drop_without_picture,
+    mesh_beside,
+    pictures_of,
+    refuse_without_pictures,
+    scan_of,
+    warn_of_radiance,
+    warn_of_unused,
+)
+from usdbrdf.capture.up_axis import up_axis_assumed
+from usdbrdf.files.tables import numbers_among
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.lens import PINHOLE, Lens
+from usdbrdf.options import CaptureOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShotCamera:
+    """Of what size its photographs are, fx, fy, cx, cy in their pixels, and how it bends light."""
+
+    resolution: tuple[int, int]
+    intrinsics: tuple[float, float, float, float]
+    lens: Lens = PINHOLE
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """One photograph of a document.
+
+    name               by which its picture is found, a path or its end
+    camera             None where it has none
+    world_from_camera  (4, 4), OpenCV's axes, in the frame of the mesh; None where it has none
+    problem            a clause that says why it cannot be used although it has both
+    """
+
+    name: str
+    camera: ShotCamera | None
+    world_from_camera: Double | None
+    problem: str = ""
+
+
+def rows_of(document: object, key: str) -> list[dict[str, Any]]:
+    """The objects of a list in a document, () where there is no such list."""
+    rows = document.get(key) if isinstance(document, dict) else None
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+def size_in(row: dict[str, Any], first: str = "width", second: str = "height") -> tuple[int, int]:
+    """A picture's size; (0, 0), which no camera has, where an object states none."""
+    size = numbers_among([row.get(first), row.get(second)], 2)
+    return (0, 0) if size is None or not (size >= 1).all() else (int(size[0]), int(size[1]))
+
+
+def scan_of_shots(
+    shots: Iterable[Shot],
+    options: CaptureOptions,
+    findings: Findings,
+    *,
+    adapter: str,
+    source: Path,
+    folder: Path,
+    pictures_in: tuple[str, ...] = (),
+    meshes: tuple[str, ...],
+    how: str,
+    up_axis: str | None = None,
+    in_metres: bool = False,
+) -> Scan:
+    """The capture of a document's photographs with the mesh beside them.
+
+    source, folder  the document that messages name, and the capture's own folder, absolute
+    pictures_in     where the pictures lie below it, "" for there; empty: where most programs have
+                    them
+    meshes, how     patterns of the program's own names, and what to do where there is no mesh
+    up_axis         None where the format does not say
+    in_metres       False where the unit is that of the reconstruction, which nobody knows
+    """
+    if not in_metres and options.meters_per_unit is None:
+        findings.warn(
+            f"{source.name}: what is reconstructed of photographs alone has no scale; taken are "
+            "metres. State --meters-per-unit. [capture.unit]"
+        )
+    pictures = pictures_of(folder, options, *pictures_in)
+    refuse_without_pictures(pictures, source)
+    records = []
+    for shot in shots:
+        if shot.world_from_camera is None or shot.camera is None or shot.problem:
+            missing = "it has no pose" if shot.world_from_camera is None else "it has no camera"
+            findings.drop(shot.name, shot.problem or missing, "capture.alignment")
+            continue
+        image = pictures.named(shot.name)
+        if image is None:
+            drop_without_picture(shot.name, findings)
+            continue
+        records.append(
+            FrameRecord(
+                name=shot.name,
+                image_path=image,
+                world_from_camera=opengl_from_opencv(shot.world_from_camera),
+                intrinsics=shot.camera.intrinsics,
+                resolution=shot.camera.resolution,
+                lens=shot.camera.lens if shot.camera.lens.bends else PINHOLE,
+                mask_path=pictures.mask_of(image, folder, options),
+            )
+        )
+    records.sort(key=lambda record: record.image_path)
+    warn_of_radiance(pictures.instead, findings, source)
+    warn_of_unused(pictures, (r.image_path for r in records), findings, source)
+    return scan_of(
+        records,
+        partial(mesh_beside, folder, options, *meshes, how=how),
+        options,
+        findings,
+        adapter=adapter,
+        source=source,
+        folder=folder,
+        up_axis=up_axis or up_axis_assumed(records, options, findings, source.name),
+    )
