@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,6 +101,15 @@ def test_versions_follow_each_other_and_never_change(room, tmp_path):
     assert bytes_of(dest / "v001") == first
     assert versions_in(dest) == ["v001", "v002"]
     assert publish(folder, dest, PublishOptions(version="v002"))["new"] is False
+
+
+def test_the_same_again_is_none_where_the_folder_is_named_by_a_relative_path(
+    room, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert publish(room.asset.folder, Path("versions"))["new"] is True
+    again = publish(room.asset.folder, Path("versions"))
+    assert (again["version"], again["new"]) == ("v001", False)
 
 
 def test_a_changed_file_is_named(room, tmp_path):
