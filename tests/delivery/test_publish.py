@@ -27,6 +27,7 @@ from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import Stamp, stamp_path, write_stamp
 from usdbrdf.options import PublishOptions
 from usdbrdf.page.report import report
+from usdbrdf.pipeline import working_on
 from usdbrdf.validation.validate import own_findings, validate
 
 RED = """over "room" { over "geo" { over "Stuhl_No_1" { over "mtl" {
@@ -200,11 +201,13 @@ def test_neither_what_was_changed_by_hand_nor_steps_of_two_runs(room, tmp_path):
     publish(folder, dest)
 
 
-def test_a_version_is_not_reviewed_and_bears_what_systems_leave(room, tmp_path):
+def test_a_version_is_neither_reviewed_nor_worked_in_and_bears_what_systems_leave(room, tmp_path):
     publish(room.asset.folder, tmp_path)
     version = tmp_path / "v001"
     with pytest.raises(OwnershipConflict, match=r"\[review\.published\]$"):
         write_review(Asset.made(version), {})
+    with pytest.raises(OwnershipConflict, match=r"never.*\[ownership\.published\]$"):
+        working_on(version).__enter__()
     (version / ".DS_Store").write_bytes(b"")
     assert not list(changes(version))
     (version / "more.usda").write_text("#usda 1.0\n")
