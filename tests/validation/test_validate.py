@@ -3,6 +3,7 @@
 import pytest
 from pxr import Sdf, Usd
 
+from tests.json_schemas import checked
 from tests.validation.faults import edited, opinion
 from usdbrdf.asset.layout import ROLES
 from usdbrdf.cli import main
@@ -194,3 +195,16 @@ def test_what_a_package_names_is_looked_for_in_it(tmp_path):
     }
     assert "usdbrdf.MissingTexture" not in rules["whole"]
     assert "usdbrdf.MissingTexture" in rules["lacking"]
+
+
+def test_findings_for_programs(built, capsys):
+    root, layer = built.asset.root_layer, built.asset.folder / "fixes.usda"
+    assert main(["validate", str(built.asset.folder), "--json"]) == 0
+    sound = {"asset": str(root), "findings": [], "fix": None}
+    assert checked(capsys.readouterr().out, "validate") == sound
+    opinion(built, "/room/cameras/capture", "exposure", Sdf.ValueTypeNames.Float, 1.0)
+    assert main(["validate", str(built.asset.folder), "--json", "--fix", str(layer)]) == 7
+    told = checked(capsys.readouterr().out, "validate")
+    (finding,) = told["findings"]
+    assert (finding["severity"], finding["rule"]) == ("error", "usdbrdf.CameraExposure")
+    assert told["fix"] == {"layer": str(layer), "findings": [finding]}
