@@ -19,7 +19,7 @@ from usdbrdf.command_parser import Command, completion
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.farm_commands import Farm, FarmTable, FarmWork
 from usdbrdf.job.interrupts import loading
-from usdbrdf.job.progress import printable, say, set_quiet, show
+from usdbrdf.job.progress import printable, set_quiet, show
 from usdbrdf.option import REQUIRED, option
 from usdbrdf.options import EditOptions
 from usdbrdf.paper.options import PaperOptions
