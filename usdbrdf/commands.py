@@ -10,7 +10,7 @@ import os
 import re
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from usdbrdf import options
 from usdbrdf.cluster.options import ClusterOptions
@@ -19,7 +19,7 @@ from usdbrdf.command_parser import Command, completion
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.farm_commands import Farm, FarmTable, FarmWork
 from usdbrdf.job.interrupts import loading
-from usdbrdf.job.progress import printable, say, set_quiet, show
+from usdbrdf.job.progress import printable, set_quiet, show
 from usdbrdf.option import REQUIRED, option
 from usdbrdf.options import EditOptions
 from usdbrdf.paper.options import PaperOptions
@@ -353,7 +353,7 @@ class View(_WithAsset):
         return 0
 
 
-class Validate(Waiting):
+class Validate(Waiting, Talking):
     """Check an asset by our rules and those of USD."""
 
     asset: Path = option("ASSET", REQUIRED)
@@ -370,14 +370,18 @@ class Validate(Waiting):
         with self.reading(root):
             findings = validate(root)
             cured = write_cures(asset, self.fix) if self.fix is not None else None
-        for finding in findings:
+        for finding in () if self.json else findings:
             show(printable(str(finding)))
-        if not findings:
-            say(f"{root}: no errors")
+        lines = [] if findings else [f"{root}: no errors"]
+        found = [asdict(finding) for finding in findings]
+        summary: dict[str, Any] = {"asset": str(root), "findings": found, "fix": None}
         if cured is not None:
             done = f"cures {len(cured.findings)} findings once it is the first sublayer of {root}"
-            say(f"{cured.layer}: {done if cured.findings else 'not written, nothing can be cured'}")
-        return 7 if has_errors(findings) else 0
+            done = done if cured.findings else "not written, nothing can be cured"
+            lines.append(f"{cured.layer}: {done}")
+            written = str(cured.layer) if cured.findings else None
+            summary["fix"] = {"layer": written, "findings": list(map(asdict, cured.findings))}
+        return 7 if self.told(summary, *lines) or has_errors(findings) else 0
 
 
 class Rules(Command):

@@ -113,6 +113,11 @@ def working_on(
     if is_held(place / STATE_FOLDER):
         yield Asset.at(place)
         return
+    if place.is_dir() and Asset.at(place).is_published:
+        raise OwnershipConflict(
+            f"{place}: a published version never changes. Work in the asset that it was published "
+            "from, or in a new folder. [ownership.published]"
+        )
     with owned_folder(place, wait_s=wait_s, without_lock=without_lock) as state:
         asset, before = Asset.at(place), known_hashes(state)
         changed = edited_files(asset.folder)

@@ -8,6 +8,7 @@ import pytest
 
 from tests.json_schemas import checked
 from tests.scenes import MadeCapture, edited, make_capture
+from usdbrdf.asset.layout import Asset
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.inspection import inspect
 from usdbrdf.cli import main
@@ -145,3 +146,25 @@ def test_wrong_options_stay_wrong(capture):
         inspect(capture.folder, InspectOptions(encoding="acesfilm"))
     with pytest.raises(UsageError, match="not installed"):
         inspect(capture.folder, InspectOptions(), "colmap9")
+
+
+@pytest.mark.parametrize(
+    "part", [".", "room.usda", "layers", "layers/scan.usdc", "objects", "objects/wall", "textures"]
+)
+def test_an_asset_is_called_one(part, built, capsys):
+    """Its root layer is a stage with cameras, and so is each of its objects' files."""
+    place = built.asset.folder / part
+    assert main(["inspect", str(place)]) == 3
+    told = capsys.readouterr().err
+    assert "an asset that usdbrdf wrote, and no capture" in told
+    assert told.endswith("[capture.asset]\n")
+    assert main(["convert", str(place), "-o", str(built.asset.folder.parent / "again")]) == 3
+    assert capsys.readouterr().err == told
+    assert not (built.asset.folder.parent / "again").exists()
+
+
+def test_a_capture_beside_an_asset_or_in_its_folder_is_one(built):
+    folder = make_capture(built.asset.folder / "capture").folder
+    assert not inspect(folder, InspectOptions()).refusals
+    assert Asset.around(folder) is None
+    assert Asset.around(built.asset.folder.parent) is None

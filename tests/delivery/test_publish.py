@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import Stamp, stamp_path, write_stamp
 from usdbrdf.options import PublishOptions
 from usdbrdf.page.report import report
+from usdbrdf.pipeline import working_on
 from usdbrdf.validation.validate import own_findings, validate
 
 RED = """over "room" { over "geo" { over "Stuhl_No_1" { over "mtl" {
@@ -100,6 +102,15 @@ def test_versions_follow_each_other_and_never_change(room, tmp_path):
     assert bytes_of(dest / "v001") == first
     assert versions_in(dest) == ["v001", "v002"]
     assert publish(folder, dest, PublishOptions(version="v002"))["new"] is False
+
+
+def test_the_same_again_is_none_where_the_folder_is_named_by_a_relative_path(
+    room, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert publish(room.asset.folder, Path("versions"))["new"] is True
+    again = publish(room.asset.folder, Path("versions"))
+    assert (again["version"], again["new"]) == ("v001", False)
 
 
 def test_a_changed_file_is_named(room, tmp_path):
@@ -190,11 +201,13 @@ def test_neither_what_was_changed_by_hand_nor_steps_of_two_runs(room, tmp_path):
     publish(folder, dest)
 
 
-def test_a_version_is_not_reviewed_and_bears_what_systems_leave(room, tmp_path):
+def test_a_version_is_neither_reviewed_nor_worked_in_and_bears_what_systems_leave(room, tmp_path):
     publish(room.asset.folder, tmp_path)
     version = tmp_path / "v001"
     with pytest.raises(OwnershipConflict, match=r"\[review\.published\]$"):
         write_review(Asset.made(version), {})
+    with pytest.raises(OwnershipConflict, match=r"never.*\[ownership\.published\]$"):
+        working_on(version).__enter__()
     (version / ".DS_Store").write_bytes(b"")
     assert not list(changes(version))
     (version / "more.usda").write_text("#usda 1.0\n")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from usdbrdf.capture.formats.named_pictures import path_in_capture
@@ -126,3 +128,15 @@ def test_what_systems_and_editors_leave_is_not_part_of_a_folder(tmp_path):
         (tmp_path / name).touch()
     found = files_below(tmp_path, without=tmp_path / "own")
     assert [path.relative_to(tmp_path).as_posix() for path in found] == kept
+
+
+@pytest.mark.parametrize("way", ["relative", "through a link"])
+def test_what_is_left_out_of_a_folder_is_however_both_are_named(way, tmp_path, monkeypatch):
+    for name in ("room/a.json", "room/own/b.json"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to(tmp_path / "room")
+    folder = Path("room") if way == "relative" else tmp_path / "link"
+    assert files_below(folder, without=folder / "own") == [folder / "a.json"]
+    assert files_below(folder, without=tmp_path / "room" / "own") == [folder / "a.json"]

@@ -83,6 +83,28 @@ def test_changed_parameter_reruns_and_says_so(asset, toy):
     assert toy.run_toy(asset, 2).reason == "parameters changed: seed"
 
 
+def test_no_folder_stays_of_which_all_files_are_gone(tmp_path):
+    """Objects that have another name lie in another folder."""
+
+    def run(*names):
+        def work(run):
+            for name in names:
+                run.output(f"objects/{name}/{name}.usda").write_text(name)
+            return {}
+
+        run_task(tmp_path, "one", order=1, parameters={"names": names}, inputs={}, work=work)
+        return sorted(path.name for path in tmp_path.glob("objects/*"))
+
+    assert run("chair", "wall") == ["chair", "wall"]
+    (tmp_path / "objects/chair/mine.txt").write_text("what somebody put there")
+    assert run("stool", "wall") == ["chair", "stool", "wall"]
+    assert run("stool") == ["chair", "stool"]
+    (tmp_path / "objects/chair/mine.txt").unlink()
+    (tmp_path / "objects/chair").rmdir()
+    assert run() == []
+    assert not (tmp_path / "objects").exists()
+
+
 @pytest.mark.fault("R8")
 def test_changed_input_and_version_rerun(tmp_path, monkeypatch):
     def run(sha256):

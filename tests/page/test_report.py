@@ -218,28 +218,32 @@ def test_the_texture_of_a_map_is_made_once_for_all_cameras():
     assert all((picture.reshape(2, 3)[1] == _BACKGROUND).all() for picture in pictures)
 
 
-def test_a_frame_is_read_once_however_many_objects_it_shows(monkeypatch):
-    """Object 0 has its target frame, 1 the frame that shows most of it, 3 that of frame 7 too; 2 is
-    shown by none."""
-    read, drawn = [], []
-    monkeypatch.setattr(objects, "read_frame", lambda _, number: read.append(number) or number)
+def test_a_frame_is_read_and_traced_once_however_many_objects_it_shows(monkeypatch):
+    """Object 0 has its target frame, 1 the frame that shows most of it, 3 that of frame 7 too; no
+    frame shows 2."""
+    read, traced, drawn = [], [], []
+    pixels = SimpleNamespace(radiance=np.zeros((1, 1, 3)), valid=np.ones((1, 1), bool))
+    monkeypatch.setattr(objects, "read_frame", lambda _, number: read.append(number) or pixels)
+    monkeypatch.setattr(objects, "seen_in_frame", lambda _, view: traced.append(view.camera))
     monkeypatch.setattr(objects, "_numbers", lambda _a, i, *_: {"prim": i, "status": "prior"})
 
-    def pictures(_frames, pixels, _seen, index, frame, box, _status, **_):
-        assert pixels == frame
-        drawn.append((index, frame, box.tolist()))
-        return {"frame": frame}
+    def pictures(frame, _seen, index, box, _status, **_):
+        assert frame.view.camera == frame.number
+        drawn.append((index, frame.number, box.tolist()))
+        return {"frame": frame.number}
 
     monkeypatch.setattr(objects, "_pictures", pictures)
     share = np.array([[0.1, 0.2, 0, 0.1], [0.3, 0.1, 0, 0.2]], np.float32)
     where = Seen(share=share, box=np.arange(8, dtype=np.float32).reshape(2, 4, 1))
-    atlas = SimpleNamespace(frames=None, scene=SimpleNamespace(objects=[None] * 4))
+    frames = SimpleNamespace(camera=int)
+    atlas = SimpleNamespace(frames=frames, scene=SimpleNamespace(objects=[None] * 4))
     fits = [SimpleNamespace(target_frame=target) for target in (3, -1, -1, 7)]
-    rows = objects.object_rows(atlas, None, fits, where, [3, 7], photographs=True, seed=0)
+    seen = SimpleNamespace(lit=None)
+    rows = objects.object_rows(atlas, seen, fits, where, [3, 7], photographs=True, seed=0)
     assert [row["prim"] for row in rows] == [0, 1, 2, 3]
     assert [row.get("frame") for row in rows] == [3, 3, None, 7]
     assert drawn == [(0, 3, [0]), (1, 3, [1]), (3, 7, [7])]
-    assert read == [3, 7]
+    assert read == traced == [3, 7]
 
 
 def test_of_more_lamps_than_a_page_can_light_the_weakest_are_one():

@@ -81,7 +81,7 @@ def test_what_is_said_comes_back_and_is_metadata_alone(built):
 def test_equal_words_are_equal_bytes_and_the_edits_stay(built):
     asset = built.asset
     edits = asset.edits_layer.read_bytes()
-    said = {CHAIR: {"verdict": "accept"}, WALL: {"comment": "flat"}}
+    said = {CHAIR: {"verdict": "accept"}, WALL: {"comment": "flat,\n\t平 \u202eflat"}}
     write_review(asset, judgements_of(asset, said))
     first = review_file(asset).read_bytes()
     write_review(asset, judgements_of(asset, dict(reversed(said.items()))))
@@ -97,6 +97,9 @@ def test_equal_words_are_equal_bytes_and_the_edits_stay(built):
         {CHAIR: {"verdict": "maybe"}},
         {CHAIR: {"directive": "gold"}},
         {CHAIR: {"comment": "x" * 2001}},
+        {CHAIR: {"comment": "what follows a zero byte \0 a layer loses"}},
+        {CHAIR: {"comment": "half a character \ud83d"}},
+        {CHAIR: {"comment": "\x1b]0;what a terminal obeys\a"}},
         {CHAIR: {"comment": 3}},
         {CHAIR: "accept"},
     ],

@@ -3,9 +3,13 @@
 import pytest
 from pxr import Sdf, Usd
 
+from tests.json_schemas import checked
 from tests.validation.faults import edited, opinion
 from usdbrdf.asset.layout import ROLES
 from usdbrdf.cli import main
+from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.job.stamp import stamp_of, stamp_path, write_stamp
 from usdbrdf.validation.rule import Severity
 from usdbrdf.validation.validate import has_errors, listed_rules, own_findings, validate
 
@@ -53,11 +57,35 @@ def test_usds_own_validators_are_asked(built):
     )
 
 
-def test_a_missing_sublayer_is_a_finding(built):
-    built.asset.layer("shading").unlink()
-    findings = "\n".join(map(str, validate(built.asset.root_layer)))
-    assert "shading.usda" in findings
-    assert "[usdValidation:CompositionErrorTest.CompositionError]" in findings
+@pytest.mark.parametrize("role", ROLES)
+def test_a_missing_layer_is_one_finding(built, role):
+    """Not one for each thing that it held, nor one of each rule that meets it."""
+    built.asset.layer(role).unlink()
+    (finding,) = validate(built.asset.root_layer)
+    assert finding.rule == "usdbrdf.LayerMissing"
+    assert f"its sublayer @{built.asset.layer(role)}@ is not there." in finding.message
+
+
+def test_a_missing_payload_is_one_finding(built):
+    built.asset.contents_layer.unlink()
+    (finding,) = validate(built.asset.root_layer)
+    assert finding.rule == "usdbrdf.LayerMissing"
+    assert f"its payload @{built.asset.contents_layer}@ is not there." in finding.message
+
+
+def test_maps_that_were_mixed_up_are_an_error(built):
+    mixed, other = (built.asset.folder / f"textures/{n}.lit.exr" for n in ("Stuhl_No_1", "lamp"))
+    write_exr(other, read_exr(mixed) + 1)
+    stamp = stamp_of("texture", {}, {})
+    for file in (mixed, other):
+        stamp.outputs[f"textures/{file.name}"] = sha256_of(file)
+    path = stamp_path(built.asset.folder, 2, "texture")
+    path.parent.mkdir(parents=True)
+    write_stamp(path, stamp)
+    mixed.write_bytes(other.read_bytes())
+    (finding,) = validate(built.asset.root_layer)
+    assert (finding.rule, finding.severity) == ("usdbrdf.LayerEdited", Severity.ERROR)
+    assert finding.message == f"@{mixed}@ holds what was written into @{other}@."
 
 
 def test_a_reference_that_leads_nowhere_is_found_once_and_nothing_is_printed(built, capfd):
@@ -167,3 +195,16 @@ def test_what_a_package_names_is_looked_for_in_it(tmp_path):
     }
     assert "usdbrdf.MissingTexture" not in rules["whole"]
     assert "usdbrdf.MissingTexture" in rules["lacking"]
+
+
+def test_findings_for_programs(built, capsys):
+    root, layer = built.asset.root_layer, built.asset.folder / "fixes.usda"
+    assert main(["validate", str(built.asset.folder), "--json"]) == 0
+    sound = {"asset": str(root), "findings": [], "fix": None}
+    assert checked(capsys.readouterr().out, "validate") == sound
+    opinion(built, "/room/cameras/capture", "exposure", Sdf.ValueTypeNames.Float, 1.0)
+    assert main(["validate", str(built.asset.folder), "--json", "--fix", str(layer)]) == 7
+    told = checked(capsys.readouterr().out, "validate")
+    (finding,) = told["findings"]
+    assert (finding["severity"], finding["rule"]) == ("error", "usdbrdf.CameraExposure")
+    assert told["fix"] == {"layer": str(layer), "findings": [finding]}

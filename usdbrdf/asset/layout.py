@@ -16,6 +16,9 @@ from usdbrdf.job.stamp import read_stamp, stamp_path
 
 # The layers that the tasks write, weakest first; each sees only those before it.
 ROLES = ("scan", "texturing", "shading", "material")
+# What the tasks write into, but for files of the folder itself; and how many names a path to any of
+# these files has, that of the asset among them: NAME/objects/OBJECT/OBJECT.usda.
+_OWN_FOLDERS, _DEEPEST = ("layers", "objects", "textures", "previews"), 4
 # The variant set that chooses among several lightings of a scene.
 LIGHTING = "lighting"
 
@@ -65,6 +68,21 @@ class Asset:
                 "its root layer. [asset.missing]"
             )
         return asset
+
+    @staticmethod
+    def around(place: Path) -> Asset | None:
+        """The asset that a path leads to, or to a part of: its folder, its root layer, or what its
+        own folders hold; None where there is none."""
+        place = Path(place).absolute()
+        for folder in (place, *place.parents)[:_DEEPEST]:
+            with suppress(InputRefused):
+                asset = Asset.at(folder)
+                inside = place.relative_to(folder).parts[:1]
+                parts = {(), (asset.root_layer.name,), *((name,) for name in _OWN_FOLDERS)}
+                made = asset.layer("scan").is_file() or asset.contents_layer.is_file()
+                if inside in parts and made and asset.root_layer.is_file():
+                    return asset
+        return None
 
     @property
     def lightings(self) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -66,6 +67,9 @@ class Judgement:
             return f"the directive {self.directive!r} is none of {', '.join(DIRECTIVES)}."
         if len(self.comment) > MAX_COMMENT:
             return f"the comment has {len(self.comment)} characters, at most {MAX_COMMENT} may be."
+        if any(unicodedata.category(c) in ("Cc", "Cs") and c not in "\t\n\r" for c in self.comment):
+            # USD stores text up to a zero byte, and a terminal obeys some of them.
+            return "the comment holds control characters, or halves of characters."
         return ""
 
     def change(self, fit: FittedObject | None) -> str:

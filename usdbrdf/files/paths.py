@@ -90,11 +90,12 @@ def refuse_lost_folder() -> None:
 def files_below(folder: Path, *, without: Path) -> list[Path]:
     """The files in a folder and in those below it, sorted, but for those in ``without`` and what
     operating systems and editors leave by themselves."""
-    own = without.resolve()
+    # Both may be named by a relative path, or through a link.
+    whole, own = folder.resolve(), without.resolve()
     return sorted(
         path
         for path in folder.rglob("*")
         if not any(path.match(pattern) for pattern in _LITTER)
         and path.is_file()
-        and not path.is_relative_to(own)
+        and not (whole / path.relative_to(folder)).is_relative_to(own)
     )

@@ -411,8 +411,8 @@ def _undo(asset: Path, journal: Stamp, done: Stamp) -> None:
 
 
 def _retire(asset: Path, journal: Stamp) -> set[Path]:
-    """Delete what earlier runs made and this one did not, unless somebody edited it; the folders
-    where such files are or were."""
+    """Delete what earlier runs made and this one did not, unless somebody edited it, and folders in
+    which nothing is left; the folders where such files, or folders, are or were."""
     folders = set()
     for relative, hashes in journal.earlier.items():
         path = asset / relative
@@ -421,4 +421,13 @@ def _retire(asset: Path, journal: Stamp) -> set[Path]:
             if path.is_file() and sha256_of(path) in hashes:
                 inside(asset, path.parent)
                 path.unlink()
-    return folders
+    kept = {_first_that_holds_something(asset, folder) for folder in folders if folder.is_dir()}
+    return {folder for folder in kept if folder.is_dir()}
+
+
+def _first_that_holds_something(asset: Path, folder: Path) -> Path:
+    """The folder, or the first above it that is not empty; those that are get removed."""
+    while folder != asset and next(folder.iterdir(), None) is None:
+        folder.rmdir()
+        folder = folder.parent
+    return folder

@@ -267,23 +267,38 @@ class FrameSamples(NamedTuple):
         return np.asarray(1 / (level + floor) ** 2, np.float32)
 
 
+class FrameSeen(NamedTuple):
+    """What the pixels of a frame show, whichever object is asked for: the object, or -1, (H, W)
+    int32; A1 and A2, (H, W)."""
+
+    owner: Int
+    highlight: Bool
+
+
+def seen_in_frame(lit: LitScene, view: View) -> FrameSeen:
+    """The same of all pixels of a frame, traced."""
+    shape = view.valid.shape
+    points = visible_points(lit, view.camera, view.camera.pixels())
+    highlight = mirror_hits_emitter(lit, points).reshape(shape) & view.valid
+    return FrameSeen(lit.owner(points.face).reshape(shape), highlight)
+
+
 def frame_samples(
-    lit: LitScene, view: View, index: int, max_pixels: int, seed: int
+    lit: LitScene, view: View, seen: FrameSeen, index: int, max_pixels: int, seed: int
 ) -> tuple[FrameSamples | None, int]:
     """At most ``max_pixels`` of object ``index``, and their number; None if they are too few.
+
+    seen  of the same view: to trace it takes longer than all that is done for one object
 
     Each pixel is the mean of 2 x 2 surface points with 52 rays each, traced once for all
     roughnesses.
     """
-    pixels, shape = view.camera.pixels(), view.valid.shape
-    seen = visible_points(lit, view.camera, pixels)
-    highlight = mirror_hits_emitter(lit, seen).reshape(shape) & view.valid
     random = np.random.default_rng([seed, index])
     chosen, stands_for = object_pixels(
-        lit.owner(seen.face).reshape(shape), view.valid, highlight, index, max_pixels,
-        random.permutation,
-    )  # fmt: skip
-    whole, points = sub_pixel_points(lit, view.camera, pixels[chosen], index, _SUB_PIXEL)
+        seen.owner, view.valid, seen.highlight, index, max_pixels, random.permutation
+    )
+    at = view.camera.pixels()[chosen]
+    whole, points = sub_pixel_points(lit, view.camera, at, index, _SUB_PIXEL)
     chosen, stands_for = chosen[whole], stands_for[whole]
     if len(chosen) < MIN_PIXELS:
         return None, len(chosen)
@@ -298,7 +313,8 @@ def fit_target_frame(
     lit: LitScene, view: View, index: int, residual: Residual, max_pixels: int, seed: int
 ) -> tuple[GridFit | None, int]:
     """Fit object ``index`` in its target frame: (fit, number of pixels), fit None if too few."""
-    samples, number = frame_samples(lit, view, index, max_pixels, seed)
+    seen = seen_in_frame(lit, view)
+    samples, number = frame_samples(lit, view, seen, index, max_pixels, seed)
     if samples is None:
         return None, number
     basis = _of_one_phi(samples)
@@ -318,7 +334,8 @@ def metal_of_target_frame(
 ) -> tuple[MetalFit | None, int]:
     """The same of an object that somebody knows to be a metal, residuals as of "scaled": what it
     shows is all lobe, also what the texture holds of it."""
-    samples, number = frame_samples(lit, view, index, max_pixels, seed)
+    seen = seen_in_frame(lit, view)
+    samples, number = frame_samples(lit, view, seen, index, max_pixels, seed)
     if samples is None:
         return None, number
     return fit_metal(samples.observed, samples.weight(), _of_one_phi(samples)), number

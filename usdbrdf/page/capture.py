@@ -151,7 +151,7 @@ def findings(
             "determine the numbers."
         )
     if unseen := count.get("unseen"):
-        told.append(f"{unseen} {'was' if unseen == 1 else 'were'} shown by no photograph.")
+        told.append(f"No photograph shows {unseen if unseen < total else 'any'} of them.")
     if lamps := count.get("lamp"):
         told.append(f"{lamps} {'is a lamp' if lamps == 1 else 'are lamps'}, found by shining.")
     texture, shade = found["texture"], found["shade"]

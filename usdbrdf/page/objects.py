@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from usdbrdf.evaluation.metrics import finite
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.job.progress import progress
-from usdbrdf.material.fit_target import frame_samples, relative_costs
+from usdbrdf.material.fit_target import FrameSeen, frame_samples, relative_costs, seen_in_frame
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import LAMP
@@ -55,15 +55,32 @@ def object_rows(
     shown = [_place_of(where, chosen, i, fits[i].target_frame) for i in range(len(objects))]
     # By their frames, so that each frame is read once however many objects it shows.
     order = sorted((at, i) for i, at in enumerate(shown) if at is not None)
-    read, pixels = -1, None
+    read, looked = -1, None
     for at, i in progress(order, total=len(order), label="report", unit="objects"):
-        if pixels is None or at != read:
-            read, pixels = at, read_frame(atlas.frames, chosen[at])
+        if looked is None or at != read:
+            read, looked = at, _looked_at(atlas.frames, chosen[at], seen)
         rows[i] |= _pictures(
-            atlas.frames, pixels, seen, i, chosen[at], where.box[at, i], rows[i]["status"],
+            looked, seen, i, where.box[at, i], rows[i]["status"],
             photographs=photographs, seed=seed,
         )  # fmt: skip
     return rows
+
+
+class _LookedAt(NamedTuple):
+    """A frame, as all objects that it shows need it."""
+
+    number: int
+    pixels: FramePixels
+    view: View
+    owners: FrameSeen
+
+
+def _looked_at(frames: Frames, number: int, seen: ViewedAsset) -> _LookedAt:
+    pixels = read_frame(frames, number)
+    view = View(
+        radiance=np.nan_to_num(pixels.radiance), valid=pixels.valid, camera=frames.camera(number)
+    )
+    return _LookedAt(number, pixels, view, seen_in_frame(seen.lit, view))
 
 
 def _place_of(where: Seen, chosen: Sequence[int], index: int, target: int) -> int | None:
@@ -177,26 +194,23 @@ def _of_metal(fit: FittedObject) -> str:
 
 
 def _pictures(
-    frames: Frames,
-    pixels: FramePixels,
+    frame: _LookedAt,
     seen: ViewedAsset,
     index: int,
-    frame: int,
     box: Sequence[float],
     status: str,
     *,
     photographs: bool,
     seed: int,
 ) -> dict[str, Any]:
-    """The object in a frame, whose ``pixels`` are given: photograph and model's picture of one
-    exposure, and the evidence."""
-    part = part_around(frames.camera(frame), box)
+    """The object in a frame: photograph and model's picture of one exposure, and the evidence."""
+    part = part_around(frame.view.camera, box)
     predicted = predict_view(seen, part.camera, _PICTURE, seed + index)
-    small = part.of(pixels)
+    small = part.of(frame.pixels)
     known = small.radiance[~small.unknown] if not small.unknown.all() else predicted.full
     exposure = display_exposure(known.reshape(-1, 3).mean(axis=1))
     found: dict[str, Any] = {
-        "frame": frame,
+        "frame": frame.number,
         "model": data_uri(to_display_srgb8(predicted.full, exposure_scale=exposure)),
         "size": [part.camera.width, part.camera.height],
     }
@@ -204,9 +218,7 @@ def _pictures(
         picture = to_display_srgb8(np.nan_to_num(small.radiance), exposure_scale=exposure)
         found["photograph"] = data_uri(picture)
     if status != "lamp":
-        view = View(radiance=np.nan_to_num(pixels.radiance), valid=pixels.valid,
-                    camera=frames.camera(frame))  # fmt: skip
-        costs = evidence(seen, view, index, seed)
+        costs = _evidence(seen, frame, index, seed)
         if costs is not None:
             found["costs"] = {
                 "phis": _PHIS, "psis": _PSIS, "values": costs.round(4).tolist(),
@@ -214,9 +226,9 @@ def _pictures(
     return found
 
 
-def evidence(seen: ViewedAsset, view: View, index: int, seed: int) -> Double | None:
+def _evidence(seen: ViewedAsset, frame: _LookedAt, index: int, seed: int) -> Double | None:
     """(phi, psi): what lobes leave unexplained of the object in one frame, relative to none."""
-    samples, _ = frame_samples(seen.lit, view, index, _EVIDENCE_PIXELS, seed)
+    samples, _ = frame_samples(seen.lit, frame.view, frame.owners, index, _EVIDENCE_PIXELS, seed)
     if samples is None:
         return None
     return np.minimum(relative_costs(seen.lit, samples, _PHIS, _PSIS), _MOST_COST)

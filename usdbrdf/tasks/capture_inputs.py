@@ -1,4 +1,4 @@
-"""The files that a capture is made of, as hashes: what changed is read anew."""
+"""What a run reads of a capture: its files as hashes, by which what changed is read anew."""
 
 from __future__ import annotations
 
@@ -98,3 +98,16 @@ def _inputs_of_objects(file: Path) -> dict[str, str]:
             texts[HANDED_ON] = json_text(asked)
         return {k: hashlib.sha256(text.encode()).hexdigest() for k, text in texts.items()}
     return whole
+
+
+def no_asset(capture: Path) -> Path:
+    """The path of a capture itself; InputRefused where it is that of an asset, or of a part of
+    one."""
+    if asset := Asset.around(capture):
+        what = "a published version of an asset" if asset.is_published else "an asset"
+        part = "" if capture.absolute() == asset.folder else f"part of {asset.folder}, "
+        raise InputRefused(
+            f"{capture}: {part}{what} that usdbrdf wrote, and no capture. Name the capture that it "
+            "was made of; validate, report and view look at assets. [capture.asset]"
+        )
+    return capture

@@ -30,7 +30,7 @@ from usdbrdf.capture.native import as_copied, refuse_taken, write_capture
 from usdbrdf.errors import UsageError
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.options import AUTO, IngestOptions
-from usdbrdf.tasks.capture_inputs import inputs_of_captures, parameters_of
+from usdbrdf.tasks.capture_inputs import inputs_of_captures, no_asset, parameters_of
 from usdbrdf.tasks.layers_to_come import write_layers_to_come
 from usdbrdf.tasks.photometry import asked_of_its_pixels
 from usdbrdf.tasks.task import Task, warned
@@ -49,7 +49,7 @@ def ingest(
     weakest layer of ``asset``, and a single one as a capture of our own format into ``copy_to``.
     Raises InputRefused, and OwnershipConflict where ``copy_to`` is taken or the asset is of other
     lightings; nothing is published then."""
-    paths = (capture,) if isinstance(capture, Path) else tuple(capture)
+    paths = tuple(map(no_asset, [capture] if isinstance(capture, Path) else capture))
     lightings = names_of_lightings(paths)
     captures = dict(zip(lightings or ("",), paths, strict=True))
     options_of = options_of_lightings(options, lightings)

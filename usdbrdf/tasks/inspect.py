@@ -16,6 +16,7 @@ from usdbrdf.files.frames import read_frame
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
+from usdbrdf.tasks.capture_inputs import no_asset
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
 from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
 from usdbrdf.tasks.turned import frames_to_compare, refuse_turned
@@ -26,6 +27,10 @@ def inspect(
     capture: Path, options: InspectOptions, adapter: str | None = None, *, plugins: bool = True
 ) -> Inspection:
     """``capture.inspection``, and whether poses, mesh and frames agree."""
+    try:
+        no_asset(capture)
+    except InputRefused as refusal:
+        return Inspection(source=capture, refusals=(refusal,))
     found = inspect_capture(capture, options, adapter, plugins=plugins)
     mesh, every = found.mesh, found.frames
     if mesh is None or every is None or not found.could_be_read:

@@ -12,14 +12,15 @@ from pathlib import Path
 
 from pxr import Ar, Sdf, Usd
 
-from usdbrdf.asset.layout import ROLES
 from usdbrdf.asset.manifest import changes
 from usdbrdf.asset.properties import SCHEMA_VERSION
 from usdbrdf.asset.readers.compose import named_files
 from usdbrdf.asset.readers.scene import asset_file
 from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.ownership import edited_files
+from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, located, record_of, rule
 
 _HEADER = ("metersPerUnit", "upAxis", "timeCodesPerSecond")
@@ -37,12 +38,13 @@ def layer_missing(scene: AssetStage) -> Iterator[Fault]:
 
     Run usdbrdf convert again, which makes what is missing; or restore the sublayers of the root
     layer."""
-    for holder, named, expected in _sublayers(scene):
+    for path, holder in scene.missing_layers.items():
+        kind = "payload" if scene.asset and path == scene.asset.contents_layer else "sublayer"
+        yield Fault(holder, f"its {kind} @{path}@ is not there.")
+    for holder, named, expected in scene.expected_sublayers:
         for layer in expected:
-            if layer not in named:
+            if layer not in named and layer not in scene.missing_layers:
                 yield Fault(holder, f"@{layer}@ is not among its sublayers.")
-            elif not layer.is_file():
-                yield Fault(holder, f"its sublayer @{layer}@ is not there.")
 
 
 @rule(Severity.ERROR)
@@ -54,7 +56,7 @@ def layer_order(scene: AssetStage) -> Iterator[Fault]:
     them.
 
     Restore the order in the root layer; mute a layer instead of moving it."""
-    for holder, named, expected in _sublayers(scene):
+    for holder, named, expected in scene.expected_sublayers:
         found = [layer for layer in named if layer in expected]
         if found != [layer for layer in expected if layer in found]:
             yield Fault(
@@ -62,21 +64,6 @@ def layer_order(scene: AssetStage) -> Iterator[Fault]:
                 f"the sublayers are in the order {', '.join(p.name for p in found)}; "
                 f"strongest first it is {', '.join(p.name for p in expected)}.",
             )
-
-
-def _sublayers(scene: AssetStage) -> Iterator[tuple[Sdf.Layer, list[Path], list[Path]]]:
-    """The root layer and contents.usda: the sublayers that they name, and those that they should,
-    strongest first."""
-    root, asset = scene.asset_root, scene.asset
-    if not root or not asset:
-        return
-    roles = [*reversed(ROLES)]
-    interfaces = [asset.interface(role) for role in roles]
-    expected = {asset.root_layer: [asset.edits_layer, *interfaces]}
-    expected[asset.contents_layer] = [*(asset.layer(role) for role in roles), interfaces[-1]]
-    for layer in scene.layers:
-        if wanted := expected.get(Path(layer.realPath)):
-            yield layer, [located(layer, path) for path in layer.subLayerPaths], wanted
 
 
 @rule(Severity.ERROR)
@@ -116,15 +103,26 @@ def schema_version(scene: AssetStage) -> Iterator[Fault]:
 @rule(Severity.WARNING)
 def layer_edited(scene: AssetStage) -> Iterator[Fault]:
     """Layers and textures that the pipeline wrote are as it wrote them. Edits belong into
-    edits.usda: those made elsewhere stop the next run, or are lost with it.
+    edits.usda: those made elsewhere stop the next run, or are lost with it. One that holds what
+    another was written with is an error: it shows the maps of one object on another, or the wrong
+    ones.
 
-    Keep them with usdbrdf convert --adopt, or give them up with --discard."""
-    if scene.asset and scene.asset_root:
-        for relative in edited_files(scene.asset.folder):
+    Keep edits with usdbrdf convert --adopt, or give them up with --discard, which undoes a mix-up
+    too."""
+    if not scene.asset or not scene.asset_root:
+        return
+    folder, owners = scene.asset.folder, dict[str, str]()
+    for relative, hashes in sorted(known_hashes(folder / STATE_FOLDER).items()):
+        owners.update(dict.fromkeys(hashes, relative))
+    for relative in edited_files(folder):
+        file = folder / relative
+        if other := owners.get(sha256_of(file)):
+            problem = f"@{file}@ holds what was written into @{folder / other}@."
+            yield Fault(scene.asset_root, problem, Severity.ERROR)
+        else:
             yield Fault(
                 scene.asset_root,
-                f"@{scene.asset.folder / relative}@ was edited by hand: the next run would "
-                "write it again, and refuses to.",
+                f"@{file}@ was edited by hand: the next run would write it again, and refuses to.",
             )
 
 
@@ -239,6 +237,8 @@ def _missing(scene: AssetStage) -> Iterator[tuple[Path, list[Site]]]:
                         missing[file].append(attribute)
     for layer, path, value in scene.asset_paths:
         file = located(layer, value)
+        if file in scene.missing_layers:
+            continue
         uncomposed = path.isEmpty or path.ContainsPrimVariantSelection()
         if uncomposed and not _URI.match(value) and file not in missing and not _is_there(file):
             missing[file].append(layer)
@@ -268,8 +268,9 @@ def orphan_texture(scene: AssetStage) -> Iterator[Fault]:
     folder = scene.asset.folder / "textures" if scene.asset else None
     if folder is None or scene.asset_root is None or not folder.is_dir():
         return
-    if any(record_of(layer).get("state") == "pending" for layer in scene.own_layers):
-        return  # the textures of a stage that runs again may be there before its layer
+    pending = any(record_of(layer).get("state") == "pending" for layer in scene.own_layers)
+    if pending or scene.missing_layers:
+        return  # their layer is written after them, or gone
     paths = [(layer, value) for layer, _, value in scene.asset_paths if not _URI.match(value)]
     named = {located(layer, value).name for layer, value in paths}
     tiles = [_pattern(name) for name in named if _UDIM in name]

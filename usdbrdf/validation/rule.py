@@ -74,6 +74,37 @@ class AssetStage:
         return None
 
     @cached_property
+    def expected_sublayers(self) -> tuple[tuple[Sdf.Layer, list[Path], list[Path]], ...]:
+        """The root layer and contents.usda: the sublayers that they name, and those that they
+        should, strongest first."""
+        root, asset = self.asset_root, self.asset
+        if not root or not asset:
+            return ()
+        roles = [*reversed(ROLES)]
+        interfaces = [asset.interface(role) for role in roles]
+        expected = {asset.root_layer: [asset.edits_layer, *interfaces]}
+        expected[asset.contents_layer] = [*(asset.layer(role) for role in roles), interfaces[-1]]
+        return tuple(
+            (layer, [located(layer, path) for path in layer.subLayerPaths], wanted)
+            for layer in self.layers
+            if (wanted := expected.get(Path(layer.realPath)))
+        )
+
+    @cached_property
+    def missing_layers(self) -> Mapping[Path, Sdf.Layer]:
+        """Layers that an asset of ours consists of and that are not there, each with the layer that
+        is to name it. What they hold is gone with them: that it is says nothing more."""
+        missing = {
+            path: holder
+            for holder, _, expected in self.expected_sublayers
+            for path in expected
+            if not path.is_file()
+        }
+        if self.asset_root and self.asset and not self.asset.contents_layer.is_file():
+            missing[self.asset.contents_layer] = self.asset_root
+        return missing
+
+    @cached_property
     def scopes(self) -> Scopes | None:
         return Scopes.of(self.asset) if self.asset else None
 

@@ -48,6 +48,7 @@ _BUILT_IN = frozenset(
 )
 # Ours tell textures from photographs, and where a missing file is named.
 _REPLACED = frozenset({"usdUtilsValidators:MissingReferenceValidator"})
+_COMPOSES = "usdValidation:CompositionErrorTest.CompositionError"
 _SEVERITIES = {
     UsdValidation.ValidationErrorType.Warn: Severity.WARNING,
     UsdValidation.ValidationErrorType.Info: Severity.INFO,
@@ -78,7 +79,10 @@ def validate(root_layer: Path) -> list[Finding]:
         scene = AssetStage(opened)
         others = map(standard_findings, scene.only_in_other_looks())
         found = [*standard_findings(opened), *chain.from_iterable(others)]
-        return [*own_findings(scene), *found]
+        gone = [f"@{layer}@" for layer in scene.missing_layers]
+        # LayerMissing says it in words that help.
+        again = [f for f in found if f.rule == _COMPOSES and any(x in f.message for x in gone)]
+        return [*own_findings(scene), *(f for f in found if f not in again)]
 
 
 def own_findings(subject: Usd.Stage | AssetStage) -> list[Finding]:

@@ -53,6 +53,8 @@ def look_incomplete(scene: AssetStage) -> Iterator[Fault]:
     viewer falls back to, which is easily taken for a measurement.
 
     Run usdbrdf convert again, or bind a material to the object inside that look."""
+    if scene.missing_layers:
+        return
     root = scene.root_prim.GetPath() if scene.root_prim else Sdf.Path()
     inside = [item for item in scene.objects if item.GetPath().HasPrefix(root)]
     for look in sorted(scene.own_variants(LOOKS)):
