@@ -132,7 +132,7 @@ def reason(
     clipped_on: Sequence[str],
 ) -> str:  # fmt: skip
     """Why, in a sentence or two."""
-    said = []
+    said: list[str] = []
     for one in objects:
         what = f"the reflection of {one.reflects}" if one.reflects else "what reflects"
         if not said:  # it begins a sentence
