@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 
 import usdbrdf
 from tests.advice.plate_room import ROOM, frame_poses, highlight, mesh, write_capture
-from usdbrdf.asset.advice import read_advice, write_advice
+from usdbrdf.advice.words import reason
+from usdbrdf.asset.advice import AdvisedObject, read_advice, write_advice
 from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, OwnershipConflict
@@ -188,3 +189,18 @@ def test_json_is_as_its_schema_says(advised):
     del document["poses"][0]["reason"]
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.Draft202012Validator(schema).validate(document)
+
+
+def test_a_reason_is_a_sentence():
+    def one(reflects):
+        return AdvisedObject(
+            prim_path="/room/geo/ball/ball", identifier="ball", reflects=reflects,
+            phi_error=0.3, psi_error=0.3, phi_error_expected=0.1, psi_error_expected=0.2,
+            measured_expected=0.5,
+        )  # fmt: skip
+
+    better = "on ball: psi +-0.30 -> +-0.20, phi +-0.30 -> +-0.10"
+    told = reason([one("lamp"), one("")], 0, [], 0, [])
+    assert told == f"The reflection of lamp {better}; what reflects {better}."
+    assert reason([one("")], 0, [], 0, []).startswith("What reflects on ball")
+    assert reason([], 0, [], 1, ["lamp"]) == "lamp without clipping."

@@ -132,9 +132,11 @@ def reason(
     clipped_on: Sequence[str],
 ) -> str:  # fmt: skip
     """Why, in a sentence or two."""
-    said = []
+    said: list[str] = []
     for one in objects:
         what = f"the reflection of {one.reflects}" if one.reflects else "what reflects"
+        if not said:  # it begins a sentence
+            what = what[0].upper() + what[1:]
         said.append(f"{what} on {one.identifier}: {_better(one)}")
     if new_m2 > 0:
         on = f" ({', '.join(new_on)})" if new_on else ""
