@@ -141,3 +141,37 @@ def _project(pose: np.ndarray, lens: np.ndarray, points: np.ndarray) -> np.ndarr
     pixels = np.stack([lens[0] * x + lens[2], lens[3] - lens[1] * y], axis=1)
     pixels[local[:, 2] > -0.2] = np.nan
     return pixels
+
+
+def radial(plane, terms):
+    """Where a lens of k1, k2 ... shows a place of the plane one before it."""
+    r2 = plane[0] ** 2 + plane[1] ** 2
+    return tuple(p * (1 + sum(k * r2 ** (i + 1) for i, k in enumerate(terms))) for p in plane)
+
+
+def brown(plane, terms):
+    """As AliceVision's DistortionBrown.cpp and OpenMVG's Camera_Pinhole_Brown.hpp write it."""
+    (x, y), (k1, k2, k3, t1, t2) = plane, terms
+    r2 = x * x + y * y
+    radial = k1 * r2 + k2 * r2**2 + k3 * r2**3
+    return (
+        x + x * radial + t2 * (r2 + 2 * x * x) + 2 * t1 * x * y,
+        y + y * radial + t1 * (r2 + 2 * y * y) + 2 * t2 * x * y,
+    )
+
+
+def fisheye(plane, terms):
+    """As AliceVision's DistortionFisheye.cpp writes it, and OpenCV."""
+    r = np.hypot(*plane)
+    theta = np.arctan(r)
+    bent = theta + sum(k * theta ** (2 * i + 3) for i, k in enumerate(terms))
+    return plane[0] * bent / r, plane[1] * bent / r
+
+
+def assert_bends(camera, room, bend, terms):
+    """The camera shows a place of the plane one before it where ``bend`` says."""
+    plane = (0.31, -0.23)
+    pixel = camera.lens.project(np.array([plane[0], -plane[1], -1.0]), camera.intrinsics)
+    fx, fy, cx, cy = room.intrinsics[0]
+    x, y = bend(plane, terms)
+    np.testing.assert_allclose(pixel, [cx + fx * x, cy + fy * y], atol=1e-9)

@@ -8,7 +8,18 @@ import json
 import numpy as np
 import pytest
 
-from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
+from tests.format_truth import (
+    HEIGHT,
+    WIDTH,
+    assert_bends,
+    assert_same,
+    brown,
+    fisheye,
+    radial,
+    truth,
+    write_image,
+    write_obj,
+)
 from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.capture.reconstructions.meshroom import shots_of
 from usdbrdf.errors import InputRefused
@@ -99,43 +110,19 @@ def test_every_version_is_the_room(tmp_path, version):
     assert scan.adapter == "meshroom"
 
 
-def _brown(plane, terms):
-    """As DistortionBrown.cpp writes it."""
-    (x, y), (k1, k2, k3, t1, t2) = plane, terms
-    r2 = x * x + y * y
-    radial = k1 * r2 + k2 * r2**2 + k3 * r2**3
-    return (
-        x + x * radial + t2 * (r2 + 2 * x * x) + 2 * t1 * x * y,
-        y + y * radial + t1 * (r2 + 2 * y * y) + 2 * t2 * x * y,
-    )
-
-
-def _fisheye(plane, terms):
-    """As DistortionFisheye.cpp writes it."""
-    r = np.hypot(*plane)
-    theta = np.arctan(r)
-    bent = theta + sum(k * theta ** (2 * i + 3) for i, k in enumerate(terms))
-    return plane[0] * bent / r, plane[1] * bent / r
-
-
 def _fov(plane, terms):
     r = np.hypot(*plane)
     bent = np.arctan(2 * r * np.tan(terms[0] / 2)) / terms[0]
     return plane[0] * bent / r, plane[1] * bent / r
 
 
-def _radial(plane, terms):
-    r2 = plane[0] ** 2 + plane[1] ** 2
-    return tuple(p * (1 + sum(k * r2 ** (i + 1) for i, k in enumerate(terms))) for p in plane)
-
-
 @pytest.mark.parametrize(
     ("kind", "terms", "bend"),
     [
-        ("radialk1", [-0.1], _radial),
-        ("radialk3", [-0.1, 0.02, 0.01], _radial),
-        ("brown", [-0.1, 0.02, 0.01, 0.004, -0.003], _brown),
-        ("fisheye", [0.02, -0.01, 0.003, -0.001], _fisheye),
+        ("radialk1", [-0.1], radial),
+        ("radialk3", [-0.1, 0.02, 0.01], radial),
+        ("brown", [-0.1, 0.02, 0.01, 0.004, -0.003], brown),
+        ("fisheye", [0.02, -0.01, 0.003, -0.001], fisheye),
         ("fisheye1", [0.9], _fov),
         ("none", [], lambda plane, terms: plane),
     ],
@@ -145,11 +132,7 @@ def test_distortions_are_those_of_alicevision(tmp_path, kind, terms, bend):
     document["intrinsics"][0] |= {"distortionType": kind, "distortionParams": _texts(terms)}
     camera = shots_of(document, (1, 2, 11), tmp_path)[0].camera
     assert camera is not None
-    plane = (0.31, -0.23)
-    pixel = camera.lens.project(np.array([plane[0], -plane[1], -1.0]), camera.intrinsics)
-    fx, fy, cx, cy = room.intrinsics[0]
-    x, y = bend(plane, terms)
-    np.testing.assert_allclose(pixel, [cx + fx * x, cy + fy * y], atol=1e-9)
+    assert_bends(camera, room, bend, terms)
 
 
 @pytest.mark.parametrize(

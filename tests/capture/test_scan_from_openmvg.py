@@ -5,10 +5,20 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 import pytest
 
-from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
+from tests.format_truth import (
+    HEIGHT,
+    WIDTH,
+    assert_bends,
+    assert_same,
+    brown,
+    fisheye,
+    radial,
+    truth,
+    write_image,
+    write_obj,
+)
 from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.capture.reconstructions.openmvg import shots_of
 from usdbrdf.errors import InputRefused
@@ -73,47 +83,20 @@ def test_pictures_that_were_not_placed_are_left_out(tmp_path):
     assert len(read_scan(tmp_path, OPTIONS).frames) == 8
 
 
-def _radial(plane, terms):
-    r2 = plane[0] ** 2 + plane[1] ** 2
-    return tuple(p * (1 + sum(k * r2 ** (i + 1) for i, k in enumerate(terms))) for p in plane)
-
-
-def _brown(plane, terms):
-    """As Camera_Pinhole_Brown.hpp writes it."""
-    (x, y), (k1, k2, k3, t1, t2) = plane, terms
-    r2 = x * x + y * y
-    radial = k1 * r2 + k2 * r2**2 + k3 * r2**3
-    return (
-        x + x * radial + t2 * (r2 + 2 * x * x) + 2 * t1 * x * y,
-        y + y * radial + t1 * (r2 + 2 * y * y) + 2 * t2 * x * y,
-    )
-
-
-def _fisheye(plane, terms):
-    r = np.hypot(*plane)
-    theta = np.arctan(r)
-    bent = theta + sum(k * theta ** (2 * i + 3) for i, k in enumerate(terms))
-    return plane[0] * bent / r, plane[1] * bent / r
-
-
 @pytest.mark.parametrize(
     ("name", "terms", "bend"),
     [
-        ("disto_k1", [-0.1], _radial),
-        ("disto_k3", [-0.1, 0.02, 0.01], _radial),
-        ("disto_t2", [-0.1, 0.02, 0.01, 0.004, -0.003], _brown),
-        ("fisheye", [0.02, -0.01, 0.003, -0.001], _fisheye),
+        ("disto_k1", [-0.1], radial),
+        ("disto_k3", [-0.1, 0.02, 0.01], radial),
+        ("disto_t2", [-0.1, 0.02, 0.01, 0.004, -0.003], brown),
+        ("fisheye", [0.02, -0.01, 0.003, -0.001], fisheye),
     ],
 )
 def test_distortions_are_those_of_openmvg(tmp_path, name, terms, bend):
     room = truth().square()
     camera = shots_of(_document(room, **{name: terms}), tmp_path)[0].camera
     assert camera is not None
-    plane = (0.31, -0.23)
-    pixel = camera.lens.project(np.array([plane[0], -plane[1], -1.0]), camera.intrinsics)
-    fx, fy, cx, cy = room.intrinsics[0]
-    x, y = bend(plane, terms)
-    np.testing.assert_allclose(pixel, [cx + fx * x, cy + fy * y], atol=1e-9)
+    assert_bends(camera, room, bend, terms)
 
 
 def test_a_sphere_has_its_size_in_its_base(tmp_path):
