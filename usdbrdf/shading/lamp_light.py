@@ -77,7 +77,7 @@ def looked_at_closely(
     asked = asked.of(_evenly_lit(surface, asked, lamps, strength, seed))
     texel, seed = asked.texel, seed ^ _SEED
     share = brought(surface, lamps, texel, seed)
-    rest = _without(lit, lamps)
+    rest = without(lit, lamps)
     asked = asked._replace(
         mirrored=np.pi * mirrored_to_frames(surface, rest, outside, frames, texel, seed)
     )
@@ -93,7 +93,7 @@ def beside_lamps(
     surface: TexturedScene, lit: Float, outside: Environment, asked: Asked, lamps: Lamps, seed: int
 ) -> Asked:
     """The texels asked with S of all but the lamps."""
-    rest = Shining.of(surface, _without(lit, lamps), outside)
+    rest = Shining.of(surface, without(lit, lamps), outside)
     known = irradiance_of_texels(surface, rest, outside, asked.texel, seed)
     floor = 1e-4 * np.median(asked.reflected)
     return asked._replace(irradiance=np.maximum(known, floor).astype(np.float64))
@@ -145,7 +145,8 @@ def _alone(lamps: Lamps) -> Iterator[Float]:
         yield np.repeat((lamps.of == k)[:, None].astype(np.float32), 3, axis=1)
 
 
-def _without(lit: Float, lamps: Lamps) -> Float:
+def without(lit: Float, lamps: Lamps) -> Float:
+    """``lit`` (T, 3) with the lamps off."""
     return np.where((lamps.of >= 0)[:, None], np.float32(0), lit)
 
 

@@ -1,9 +1,9 @@
 """The light from outside: what frames show of it, and the rest by the light that it casts.
 
 What texels reflect is their albedo times S, and S is the light of what was seen, that of patches of
-sky that no frame shows, and the sun. Contrasts on one side of one object tell of the light: first
-of the sun's direction (``sun_direction``), then of its irradiance and the patches' radiance
-(``outside_light``).
+sky that no frame shows, the sun's, and that of lamps that no frame measures. Contrasts on one side
+of one object tell of the light: first of the sun's direction (``sun_direction``), then of its
+irradiance and the patches' and lamps' radiance (``outside_light``).
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,7 +33,9 @@ from usdbrdf.shading.asked import (
 )
 from usdbrdf.shading.gloss import Mirrored, mirroring
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
-from usdbrdf.shading.outside_light import Asked, Sources, jackknife, levelled, solved
+from usdbrdf.shading.lamp_light import Lamps, brought, sources_of, without
+from usdbrdf.shading.likely_lamps import lamps_beside_daylight
+from usdbrdf.shading.outside_light import Asked, Solution, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
 from usdbrdf.transport.environment import (
@@ -140,8 +144,10 @@ def estimated_outside(
     coverage: CoverageMap,
     z_up: bool,
     seed: int,
+    said: Mapping[int, bool] = MappingProxyType({}),
 ) -> Outside | None:
-    """What the frames show of the surroundings, and what they tell of the rest."""
+    """What the frames show of the surroundings, and what they tell of the rest. said: of objects
+    whether they are lamps, where that is known."""
 
     def compute() -> dict[str, Array]:
         seen = surroundings_from_frames(surface.rays, frames, z_up)
@@ -149,7 +155,8 @@ def estimated_outside(
         lamps, known = KnownLamps.unknown(coverage.clipped), _of_measured(seen, z_up)
         light = light_of_hidden(surface, lit, coverage, known, seed, lamps)
         mirrored = mirroring(surface, light, frames, seed)
-        found = light_from_outside(surface, light, coverage, seen, z_up, seed, mirrored)
+        given = surface, light, coverage, seen, z_up, seed
+        found = light_from_outside(*given, mirrored, said)
         return found.arrays() if found else {"nothing": np.zeros(0)}
 
     arrays = run.checkpoint("outside", compute)
@@ -164,10 +171,12 @@ def light_from_outside(
     z_up: bool,
     seed: int,
     mirrored: Mirrored | None = None,
+    said: Mapping[int, bool] = MappingProxyType({}),
 ) -> Outside | None:
     """What lights the scan ``lit`` (T, 3), L_d, from outside; None where hardly a direction of its
     light leaves it. seen: what the frames show of it; mirrored: what surfaces mirror to these, None
-    where ``lit`` holds nothing of that."""
+    where ``lit`` holds nothing of that; said: of objects whether they are lamps, where that is
+    known."""
     asked = asked_texels(surface.texels, lit, coverage, seed)
     if asked is None:
         return None
@@ -190,22 +199,24 @@ def light_from_outside(
         confidence = seen.coverage.stored().reshape(HEIGHT, WIDTH)
         environment = Environment(radiance, z_up)
         return Outside(environment=environment, confidence=confidence, open_share=open_share)
-    asked = _under_what_was_seen(surface, lit, asked, seen, z_up, seed)
     used = np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi)
-    sky = _sky(asked, seen, patches, share, used, z_up)
-    # Patches that had to stand for the sun brighten what it shines on: once it is found, its place
-    # is looked for again.
-    light, sun = asked.irradiance + sky.irradiance(sky.mean), None
-    for _ in range(3):
-        sun = find_sun(surface, asked, light, z_up, sun)
-        with_sun = _with_sun(surface, asked, sky, sun, seed)
-        found = solved(*with_sun)
-        light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
-    assert sun is not None
+    look = _Look(surface, lit, seen, patches, used, z_up, seed)
+    asked, sky = look.at(asked, share)
+    sun, with_sun, found = _sun_and_sky(look, asked, sky)
+    # Lamps beside it would brighten the sky, and all the less the farther they are: as it is, it
+    # does not explain them.
+    picture = Environment(look.picture(np.exp(found.log_radiance)), z_up)
+    under_sun = picture.under(sun._replace(irradiance=np.exp(found.log_radiance[-1])))
+    lamps = lamps_beside_daylight(surface, lit, coverage, under_sun, asked, seed, said)
+    if lamps is not None:
+        look = look._replace(lamps=lamps)
+        asked, sky = look.at(asked, share)
+        sun, with_sun, found = _sun_and_sky(look, asked, sky)
+    light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
     if mirrored is not None:
         for _ in range(_LOOKS_AT_MIRRORED):
             strengths: Double = np.exp(found.log_radiance)
-            outside = Environment(_picture(seen, patches, used, strengths[:-1], z_up), z_up)
+            outside = Environment(look.picture(strengths), z_up)
             in_sun = outside.under(sun._replace(irradiance=strengths[-1]))
             asked = asked._replace(mirrored=mirrored(in_sun, asked.texel))
             sky = sky._replace(gloss=_AS_TOLD)
@@ -222,10 +233,12 @@ def light_from_outside(
         assert many is not None
         if (clear := _clearly_lit(surface, many, sun, seed)) is not None:
             share, _ = _shares(surface, clear, unseen, z_up, seed, _RAYS)
-            clear = _under_what_was_seen(surface, lit, clear, seen, z_up, seed)
+            clear, of_clear = look.at(clear, share)
             if mirrored is not None:
                 clear = clear._replace(mirrored=mirrored(in_sun, clear.texel))
-            clearly = _with_sun(surface, clear, sky._replace(share=share[used]), sun, seed)
+            # As those before told it.
+            of_clear = sky._replace(share=of_clear.share)
+            clearly = _with_sun(surface, clear, of_clear, sun, seed)
             told = solved(*clearly)
             own_error = jackknife(*clearly, told)
             if own_error[-1].max() < _MOST_CLEAR_ERROR:
@@ -238,7 +251,7 @@ def light_from_outside(
         sun, found = NO_SUN, solved(asked, sky)
         found, error = levelled(asked, sky, found), jackknife(asked, sky, found)
     radiance_of_sky = np.exp(found.log_radiance[: len(used)])
-    radiance = _picture(seen, patches, used, radiance_of_sky, z_up)
+    radiance = look.picture(radiance_of_sky)
     # By the light that each brings: nobody asks how dark dark ground is.
     weight = share[used].mean(axis=1) * radiance_of_sky.mean(axis=1)
     of_sky = error[: len(used)].max(axis=1)
@@ -255,15 +268,61 @@ def light_from_outside(
     )
 
 
-def _under_what_was_seen(
-    surface: TexturedScene, lit: Float, asked: Asked, seen: Surroundings, z_up: bool, seed: int
-) -> Asked:
-    """The texels asked with S, W/m^2, of all that frames measured."""
-    environment = _of_measured(seen, z_up)
-    shining = Shining.of(surface, lit, environment)
-    irradiance = irradiance_of_texels(surface, shining, environment, asked.texel, seed)
-    least = _DARK * np.median(asked.reflected)
-    return asked._replace(irradiance=np.maximum(irradiance, least).astype(np.float64))
+class _Look(NamedTuple):
+    """How a scan of radiance ``lit`` (T, 3) is asked for light from outside: by what was ``seen``
+    of it, by those of the patches (D,) of all directions that are ``used``, and by lamps beside it.
+    """
+
+    surface: TexturedScene
+    lit: Float
+    seen: Surroundings
+    patches: Int
+    used: Long
+    z_up: bool
+    seed: int
+    lamps: Lamps | None = None
+
+    def at(self, asked: Asked, share: Double) -> tuple[Asked, Sources]:
+        """The texels asked with S, W/m^2, of all that frames measured, and the other sources: those
+        of the patches, of which all bring ``share`` (P, N), and the lamps."""
+        surface, environment = self.surface, _of_measured(self.seen, self.z_up)
+        lit = self.lit if self.lamps is None else without(self.lit, self.lamps)
+        shining = Shining.of(surface, lit, environment)
+        irradiance = irradiance_of_texels(surface, shining, environment, asked.texel, self.seed)
+        least = _DARK * np.median(asked.reflected)
+        asked = asked._replace(irradiance=np.maximum(irradiance, least).astype(np.float64))
+        sky = _sky(asked, self.seen, self.patches, share, self.used, self.z_up)
+        if self.lamps is None:
+            return asked, sky
+        lamps = sources_of(self.lamps, brought(surface, self.lamps, asked.texel, self.seed))
+        return asked, sky._replace(
+            share=np.concatenate([sky.share, lamps.share]),
+            mean=np.concatenate([sky.mean, lamps.mean]),
+            deviation=np.append(sky.deviation, lamps.deviation),
+            bound=np.append(sky.bound, lamps.bound),
+        )
+
+    def picture(self, radiance: Double) -> Float:
+        """(HEIGHT, WIDTH, 3): what was measured, and the patches, whose radiance comes first."""
+        radiance = radiance[: len(self.used)]
+        return _picture(self.seen, self.patches, self.used, radiance, self.z_up)
+
+
+def _sun_and_sky(
+    look: _Look, asked: Asked, sky: Sources
+) -> tuple[Sun, tuple[Asked, Sources], Solution]:
+    """Where the sun stands, the sources with it, the last, at those of the texels asked that see
+    all of its disc or none, and their strengths."""
+    # Patches that had to stand for the sun brighten what it shines on: once it is found, its place
+    # is looked for again.
+    light, sun = asked.irradiance + sky.irradiance(sky.mean), None
+    for _ in range(3):
+        sun = find_sun(look.surface, asked, light, look.z_up, sun)
+        with_sun = _with_sun(look.surface, asked, sky, sun, look.seed)
+        found = solved(*with_sun)
+        light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
+    assert sun is not None
+    return sun, with_sun, found
 
 
 def _of_measured(seen: Surroundings, z_up: bool) -> Environment:
@@ -342,7 +401,8 @@ def _sky(
 ) -> Sources:
     """The patches that light what is asked."""
     known, usual = seen.coverage.measured, seen.trend(z_up)
-    if not usual.any():
+    # Where all is dark that was seen, but not all that lights the scan was, the rest is not.
+    if not usual.any() or seen.is_night():
         usual = np.tile(np.median(asked.reflected, axis=0) / np.pi, (len(usual), 1))
     bound = used >= _PATCHES
     darkest = max(_DARKEST * float(np.median(usual.max(axis=1))), 1e-30)

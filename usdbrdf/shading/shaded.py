@@ -350,7 +350,7 @@ def _light(
     known = KnownLamps(may_shine, said, doubt=doubt)
     lit = with_hidden_light(run, "hidden", surface, lit, coverage, environment, seed, known)
     # In the light of what it may be that no frame shows.
-    unseen = estimate_unseen_lamps(run, surface, lit, coverage, frames, outside, seed, said)
+    unseen = estimate_unseen_lamps(run, surface, lit, coverage, frames, environment, seed, said)
     lit = unseen.with_light(texels, lit)
     light = estimate_clipped_light(run, surface, lit, coverage, frames, environment, seed, said)
     lamps = light.groups.texels_of(light.groups.lamp) | np.isin(owner, unseen.object)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from usdbrdf.asset.layout import Asset
@@ -16,16 +17,17 @@ from usdbrdf.transport.environment import environment_from_file
 
 
 def outside_of(
-    run: TaskRun, maps: AssetMaps, options: ShadeOptions, up_axis: str
+    run: TaskRun, maps: AssetMaps, options: ShadeOptions, up_axis: str, said: Mapping[int, bool]
 ) -> Outside | None:
-    """The light from outside as a file tells it, or the capture; None without any."""
+    """The light from outside as a file tells it, or the capture; None without any. said: of
+    objects, by number, whether they are lamps, where a person says so."""
     if isinstance(options.environment, Path):
         return Outside.given(environment_from_file(options.environment, up_axis))
     if options.environment == NO_LIGHT:
         return None
     return estimated_outside(
         run, maps.surface, maps.frames, maps.lit, maps.coverage, up_axis == "Z",
-        options.sampling.seed,
+        options.sampling.seed, said,
     )  # fmt: skip
 
 

@@ -46,8 +46,8 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
     task = Task(asset=asset, name="shade", role="shading", parameters=parameters, inputs=inputs)
 
     def work(run: TaskRun) -> dict[str, Any]:
-        outside = outside_of(run, maps, options, task.header.up_axis)
         said = {i: word == LAMP for i, word in by_number(asked, maps.scene.objects).items()}
+        outside = outside_of(run, maps, options, task.header.up_axis, said)
         given = maps.surface, maps.lit, maps.coverage, maps.frames, outside
         shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said)
         published = write_outside(run, asset, outside) if outside else None
