@@ -20,6 +20,7 @@ from usdbrdf.shading.asked import CLOSELY, LEAST_OF_SEGMENT, Shining, irradiance
 from usdbrdf.shading.gloss import mirrored_irradiance, mirrored_to_frames
 from usdbrdf.shading.outside_light import (
     Asked,
+    Solution,
     Sources,
     gloss_of_scene,
     jackknife,
@@ -37,6 +38,8 @@ ROUGHLY = Sampling(standard_error=0, max_rays=32)
 _AROUND = 2
 _UNEVEN, _OF_OTHER_LIGHT = calibration.pair("unseen.uneven")
 _LEAST_EVEN = calibration.number("unseen.least_even")
+_BRIGHTER = calibration.number("unseen.brighter")
+LEAST_PART = calibration.number("unseen.least_part")
 
 
 class Lamps(NamedTuple):
@@ -117,12 +120,25 @@ def strengths(asked: Asked, sources: Sources, certain: Bool) -> Strengths:
     error = np.hypot(
         jackknife(asked, sources, found, certain), pull_of_prior(asked, sources, found)
     ).max(axis=1)
+    near, part = beside_others(asked, sources, found)
+    return Strengths(np.exp(found.log_radiance), np.asarray(error), near, part)
+
+
+def beside_others(asked: Asked, sources: Sources, found: Solution) -> tuple[Double, Double]:
+    """Of each source, (K,): S of the texels that it lights, each as much as it does, W/m^2, and
+    what part of that is its own."""
     light = (asked.irradiance + sources.irradiance(found.log_radiance)).mean(axis=1)
-    radiance = np.exp(found.log_radiance)
+    radiance = np.exp(found.log_radiance).mean(axis=1)
     lights = np.maximum(sources.share.sum(axis=1), 1e-12)
     near = (sources.share @ light) / lights
-    part = radiance.mean(axis=1) * (sources.share**2 / light).sum(axis=1) / lights
-    return Strengths(radiance, np.asarray(error), np.asarray(near), np.asarray(part))
+    part = radiance * (sources.share**2 / light).sum(axis=1) / lights
+    return np.asarray(near), np.asarray(part)
+
+
+def shining(radiance: Double, near: Double, part: Double) -> Bool:
+    """Which (K,) are clearly brighter than what only reflects, even with as much light as the
+    texels that see it receive; near and part (K,) as of ``Strengths``."""
+    return (np.pi * radiance.mean(axis=1) > _BRIGHTER * near) & (part > LEAST_PART)
 
 
 def brought(

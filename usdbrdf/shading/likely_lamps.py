@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf import calibration
-from usdbrdf.model.arrays import Double, Float, Int, Long
+from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import first_of_segments
 from usdbrdf.shading.clipped_light import ClippedGroups, clipped_groups
@@ -85,7 +85,27 @@ def strongest(groups: ClippedGroups) -> Long:
     return np.flatnonzero(groups.lamp)[:_CLIPPED]
 
 
-def lamps_beside_daylight(
+class Beside(NamedTuple):
+    """What may light a scan beside daylight: ``likely``, of those ``groups`` that clip; and of
+    objects whether they are lamps, where that is ``said``."""
+
+    likely: Likely
+    groups: ClippedGroups
+    said: Mapping[int, bool]
+
+    def __len__(self) -> int:
+        return len(self.likely.object) + len(self.likely.clipped)
+
+    def lamps(self, texels: Texels) -> Lamps:
+        """What is known of them."""
+        return self.likely.as_lamps(texels, self.groups, self.said)
+
+    def of(self, shines: Bool) -> Beside:
+        """With those of the objects that do."""
+        return self._replace(likely=self.likely.of(np.flatnonzero(shines)))
+
+
+def beside_daylight(
     surface: TexturedScene,
     lit: Float,
     coverage: CoverageMap,
@@ -93,18 +113,18 @@ def lamps_beside_daylight(
     asked: Asked,
     seed: int,
     said: Mapping[int, bool] = MappingProxyType({}),
-) -> Lamps | None:
+) -> Beside:
     """What lights the scan of radiance ``lit`` (T, 3) beside the ``environment``, though that was
-    to explain all of it; None for nothing."""
+    to explain all of it."""
     groups = clipped_groups(surface.texels, lit, coverage, said)
     unseen = unseen_objects(surface.texels, coverage, said)
     asked = asked.of(~groups.texels_of(groups.lamp)[asked.texel])
     if not (len(unseen) or groups.lamp.any()) or not len(asked.texel):
-        return None
-    likely = likely_lamps(surface, lit, environment, asked, unseen, groups, said, seed)
-    if not (len(likely.object) or len(likely.clipped)):
-        return None
-    return likely.as_lamps(surface.texels, groups, said)
+        none = np.zeros(0, np.int64)
+        return Beside(Likely(none, np.zeros((0, 3)), none), groups, said)
+    return Beside(
+        likely_lamps(surface, lit, environment, asked, unseen, groups, said, seed), groups, said
+    )
 
 
 def likely_lamps(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -33,8 +33,8 @@ from usdbrdf.shading.asked import (
 )
 from usdbrdf.shading.gloss import Mirrored, mirroring
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
-from usdbrdf.shading.lamp_light import Lamps, brought, sources_of, without
-from usdbrdf.shading.likely_lamps import lamps_beside_daylight
+from usdbrdf.shading.lamp_light import Lamps, beside_others, brought, shining, sources_of, without
+from usdbrdf.shading.likely_lamps import beside_daylight
 from usdbrdf.shading.outside_light import Asked, Solution, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
@@ -84,6 +84,7 @@ class Outside:
     open_share    of the light's directions that leave the scan; NaN if a file tells the light
     sky_error     relative standard error of what is inferred; NaN where nothing is
     sun_error     relative standard error of the sun's irradiance; NaN without a sun, or a file's
+    lamps         (K,) int64: objects that no frame shows and that must shine beside it
     """
 
     environment: Environment
@@ -91,6 +92,7 @@ class Outside:
     open_share: float = math.nan
     sky_error: float = math.nan
     sun_error: float = math.nan
+    lamps: Long = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @classmethod
     def given(cls, environment: Environment) -> Outside:
@@ -120,7 +122,12 @@ class Outside:
         image, z_up, sun = self.environment.image, self.environment.z_up, self.environment.sun
         disc = [*sun.direction, *sun.irradiance, sun.half_angle]
         numbers = [z_up, self.open_share, self.sky_error, self.sun_error, *disc]
-        return {"image": image, "confidence": self.confidence, "numbers": np.array(numbers)}
+        return {
+            "image": image,
+            "confidence": self.confidence,
+            "numbers": np.array(numbers),
+            "lamps": self.lamps,
+        }
 
     @classmethod
     def restored(cls, arrays: Mapping[str, Array]) -> Outside:
@@ -133,6 +140,7 @@ class Outside:
             open_share=open_share,
             sky_error=sky,
             sun_error=sun_error,
+            lamps=arrays["lamps"],
         )
 
 
@@ -201,17 +209,8 @@ def light_from_outside(
         return Outside(environment=environment, confidence=confidence, open_share=open_share)
     used = np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi)
     look = _Look(surface, lit, seen, patches, used, z_up, seed)
-    asked, sky = look.at(asked, share)
-    sun, with_sun, found = _sun_and_sky(look, asked, sky)
-    # Lamps beside it would brighten the sky, and all the less the farther they are: as it is, it
-    # does not explain them.
-    picture = Environment(look.picture(np.exp(found.log_radiance)), z_up)
-    under_sun = picture.under(sun._replace(irradiance=np.exp(found.log_radiance[-1])))
-    lamps = lamps_beside_daylight(surface, lit, coverage, under_sun, asked, seed, said)
-    if lamps is not None:
-        look = look._replace(lamps=lamps)
-        asked, sky = look.at(asked, share)
-        sun, with_sun, found = _sun_and_sky(look, asked, sky)
+    look, lamps, told = _with_lamps(look, asked, share, coverage, said)
+    asked, sky, sun, with_sun, found = told
     light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
     if mirrored is not None:
         for _ in range(_LOOKS_AT_MIRRORED):
@@ -265,6 +264,7 @@ def light_from_outside(
         open_share=open_share,
         sky_error=sky_error,
         sun_error=float(error[-1].max()) if shines else math.nan,
+        lamps=lamps,
     )
 
 
@@ -308,21 +308,58 @@ class _Look(NamedTuple):
         return _picture(self.seen, self.patches, self.used, radiance, self.z_up)
 
 
-def _sun_and_sky(
-    look: _Look, asked: Asked, sky: Sources
-) -> tuple[Sun, tuple[Asked, Sources], Solution]:
-    """Where the sun stands, the sources with it, the last, at those of the texels asked that see
-    all of its disc or none, and their strengths."""
+class _Told(NamedTuple):
+    """The texels asked and the sources but the sun; where that stands; those of them that see all
+    of its disc or none and the sources with it, the last; and their strengths."""
+
+    asked: Asked
+    sources: Sources
+    sun: Sun
+    with_sun: tuple[Asked, Sources]
+    found: Solution
+
+
+def _with_lamps(
+    look: _Look, asked: Asked, share: Double, coverage: CoverageMap, said: Mapping[int, bool]
+) -> tuple[_Look, Long, _Told]:
+    """How the scan is asked for daylight and for what shines beside it, the numbers of the objects
+    among these, and what it tells."""
+    told = _told(look, asked, share)
+    # Lamps beside it would brighten the sky, and all the less the farther they are: as it is, it
+    # does not explain them.
+    picture = Environment(look.picture(np.exp(told.found.log_radiance)), look.z_up)
+    under_sun = picture.under(told.sun._replace(irradiance=np.exp(told.found.log_radiance[-1])))
+    beside = beside_daylight(
+        look.surface, look.lit, coverage, under_sun, told.asked, look.seed, said
+    )
+    while len(beside):
+        look = look._replace(lamps=beside.lamps(look.surface.texels))
+        told = _told(look, asked, share)
+        of_objects = slice(len(look.used), len(look.used) + len(beside.likely.object))
+        near, part = beside_others(*told.with_sun, told.found)
+        shines = shining(np.exp(told.found.log_radiance), near, part)[of_objects]
+        shines |= look.lamps.certain[: len(shines)]
+        if shines.all():
+            return look, beside.likely.object, told
+        beside = beside.of(shines)
+    if look.lamps is not None:
+        look = look._replace(lamps=None)
+        told = _told(look, asked, share)
+    return look, np.zeros(0, np.int64), told
+
+
+def _told(look: _Look, asked: Asked, share: Double) -> _Told:
     # Patches that had to stand for the sun brighten what it shines on: once it is found, its place
     # is looked for again.
-    light, sun = asked.irradiance + sky.irradiance(sky.mean), None
+    asked, sources = look.at(asked, share)
+    light, sun = asked.irradiance + sources.irradiance(sources.mean), None
     for _ in range(3):
         sun = find_sun(look.surface, asked, light, look.z_up, sun)
-        with_sun = _with_sun(look.surface, asked, sky, sun, look.seed)
+        with_sun = _with_sun(look.surface, asked, sources, sun, look.seed)
         found = solved(*with_sun)
-        light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
+        light = asked.irradiance + sources.irradiance(found.log_radiance[:-1])
     assert sun is not None
-    return sun, with_sun, found
+    return _Told(asked, sources, sun, with_sun, found)
 
 
 def _of_measured(seen: Surroundings, z_up: bool) -> Environment:

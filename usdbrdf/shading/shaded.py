@@ -350,7 +350,8 @@ def _light(
     known = KnownLamps(may_shine, said, doubt=doubt)
     lit = with_hidden_light(run, "hidden", surface, lit, coverage, environment, seed, known)
     # In the light of what it may be that no frame shows.
-    unseen = estimate_unseen_lamps(run, surface, lit, coverage, frames, environment, seed, said)
+    shine = said if outside is None else {int(i): True for i in outside.lamps} | dict(said)
+    unseen = estimate_unseen_lamps(run, surface, lit, coverage, frames, environment, seed, shine)
     lit = unseen.with_light(texels, lit)
     light = estimate_clipped_light(run, surface, lit, coverage, frames, environment, seed, said)
     lamps = light.groups.texels_of(light.groups.lamp) | np.isin(owner, unseen.object)

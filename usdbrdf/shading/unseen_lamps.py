@@ -24,10 +24,12 @@ from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import asked_texels
 from usdbrdf.shading.clipped_light import clipped_groups
 from usdbrdf.shading.lamp_light import (
+    LEAST_PART,
     ROUGHLY,
     beside_lamps,
     brought,
     looked_at_closely,
+    shining,
     sources_of,
     strengths,
 )
@@ -35,8 +37,6 @@ from usdbrdf.shading.likely_lamps import likely_lamps, strongest, unseen_objects
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
-_BRIGHTER = calibration.number("unseen.brighter")
-_LEAST_PART = calibration.number("unseen.least_part")
 _MOST_ERROR = calibration.number("unseen.most_error")
 
 
@@ -125,7 +125,7 @@ def lamps_that_explain(
     part = np.where((np.pi * found.mean(axis=1) > near) & (error < 1), part, 0)
     part = part[: len(likely.object)]
     likeliest = np.argsort(-part, kind="stable")
-    kept = likeliest[part[likeliest] > _LEAST_PART / 2]
+    kept = likeliest[(part > LEAST_PART / 2)[likeliest] | lamps.certain[likeliest]]
     while len(kept):
         strength = np.append(found[kept], found[len(likely.object) :], axis=0).mean(axis=1)
         likely = likely.of(kept)
@@ -134,12 +134,11 @@ def lamps_that_explain(
             surface, lit, environment, frames, asked, lamps, strength, seed
         )
         own = slice(len(likely.object))
-        # Clearly brighter than what only reflects: even with as much light as the texels that see
-        # it receive.
-        brightness = np.log(np.pi * found.mean(axis=1) / near)[own]
-        lamp = (brightness > np.log(_BRIGHTER)) & (part[own] > _LEAST_PART)
+        lamp = shining(found, near, part)[own]
         if lamp.all():  # none of the others blurs what these are any more
+            brightness = np.log(np.pi * found.mean(axis=1) / near)[own]
             lamp = (brightness > 2 * error[own]) & (error[own] < _MOST_ERROR)
+        lamp |= lamps.certain[own]
         if lamp.all():
             order = np.argsort(likely.object)
             return UnseenLamps(
