@@ -209,8 +209,8 @@ def light_from_outside(
         return Outside(environment=environment, confidence=confidence, open_share=open_share)
     used = np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi)
     look = _Look(surface, lit, seen, patches, used, z_up, seed)
-    look, lamps, told = _with_lamps(look, asked, share, coverage, said)
-    asked, sky, sun, with_sun, found = told
+    look, lamps, all_told = _with_lamps(look, asked, share, coverage, said)
+    asked, sky, sun, with_sun, found = all_told
     light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
     if mirrored is not None:
         for _ in range(_LOOKS_AT_MIRRORED):
@@ -333,12 +333,13 @@ def _with_lamps(
         look.surface, look.lit, coverage, under_sun, told.asked, look.seed, said
     )
     while len(beside):
-        look = look._replace(lamps=beside.lamps(look.surface.texels))
+        lamps = beside.lamps(look.surface.texels)
+        look = look._replace(lamps=lamps)
         told = _told(look, asked, share)
         of_objects = slice(len(look.used), len(look.used) + len(beside.likely.object))
         near, part = beside_others(*told.with_sun, told.found)
         shines = shining(np.exp(told.found.log_radiance), near, part)[of_objects]
-        shines |= look.lamps.certain[: len(shines)]
+        shines |= lamps.certain[: len(shines)]
         if shines.all():
             return look, beside.likely.object, told
         beside = beside.of(shines)
