@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import Sampling, box, quad, world_of
+from tests.scenes import frames_at, look_at
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading import outside
 from usdbrdf.shading.outside import Outside, light_from_outside
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings
+from usdbrdf.shading.unseen_lamps import lamps_that_explain
 from usdbrdf.texturing.footprints import blurred
 from usdbrdf.transport.environment import (
     NO_SUN,
@@ -32,10 +34,28 @@ _UP = directions_of_pixels(HEIGHT, WIDTH, True)[..., 2]
 SKY = (np.float32([0.6, 0.8, 1.0]) * (1.5 - np.clip(_UP, 0, 1))[..., None]).astype(np.float32)
 SKY[_UP < 0] = 0.2
 
+FRAMES = frames_at(
+    [
+        look_at(np.array([4.0, -3.0, 2.5]), np.array([x, y, 0.5]))
+        for x, y in ((1, 6), (4, 6), (7, 6), (4, 2))
+    ]
+)
+
 
 @pytest.fixture(scope="module")
 def yard():
     """A yard of 8 m with walls on three sides and two blocks in it."""
+    return _yard([])
+
+
+# A panel of a square metre over the yard that looks down, and two boards beside it.
+PANEL = 14
+HUNG = [
+    quad((x, y, 3.5), (0, 1, 0), (1, 0, 0), (6, 6)) for x, y in ((2.0, 5.0), (6.0, 5.5), (5.0, 1.0))
+]
+
+
+def _yard(hung: list):
     return world_of([
         quad((0, 0, 0), (8, 0, 0), (0, 8, 0), (80, 80)),
         quad((0, 8, 0), (8, 0, 0), (0, 0, 3), (60, 24)),
@@ -43,11 +63,13 @@ def yard():
         quad((8, 0, 0), (0, 0, 3), (0, 8, 0), (24, 60)),
         *box((3, 3, 0.01), (4, 4.5, 1.5), (24, 24)),
         *box((5.5, 1.5, 0.01), (6.3, 2.3, 2.2), (24, 24)),
+        *hung,
     ])  # fmt: skip
 
 
-def _lit(world, environment: Environment, texture: float = 0.25):
-    """L_d (T, 3) with light going to and fro three times, and the albedo (T, 3)."""
+def _lit(world, environment: Environment, texture: float = 0.25, panel: float = 0.0):
+    """L_d (T, 3) with light going to and fro three times, and the albedo (T, 3). panel: radiance of
+    the object of this number."""
     surface, texels = TexturedScene(world.scene, world.texels, world.rays), world.texels
     random = np.random.default_rng(1)
     usual = random.uniform(0.15, 0.7, (len(texels.resolution), 3))[texels.object_index()]
@@ -55,13 +77,16 @@ def _lit(world, environment: Environment, texture: float = 0.25):
     albedo = np.minimum(albedo, 0.95)
     every, lit = np.arange(len(texels)), np.zeros((len(texels), 3), np.float32)
     direct = sunlight(surface, every, environment.sun, 5)
+    shines = (texels.object_index() == PANEL) & (panel > 0)
     for _ in range(3):
+        lit[shines] = panel
         arriving = irradiance_at(
             surface.rays, surface.texture(lit), lights_from_radiance(world.scene, texels, lit),
             environment, texels.position, texels.normal, independent_tiles(len(texels)),
             Sampling(standard_error=0.02, max_rays=512), surface.diagonal_m,
         ).mean  # fmt: skip
         lit = (albedo / np.pi * (arriving + direct)).astype(np.float32)
+    lit[shines] = panel
     return surface, lit, albedo
 
 
@@ -141,6 +166,28 @@ def test_what_surfaces_mirror_is_not_taken_for_light_in_their_shadows(sunny):
     assert len(asked_about) >= 2
     assert all(outside.sun.irradiance.min() > 1 for outside in asked_about)
     assert np.abs(asked_about[1].sun.irradiance - asked_about[0].sun.irradiance).max() > 0
+
+
+@pytest.mark.parametrize("panel", [15.0, 0.0])
+def test_a_lamp_that_no_frame_shows_is_told_from_the_sky_beside_it(panel: float):
+    surface, lit, _ = _lit(_yard(HUNG), Environment(SKY / 4, True), texture=0.1, panel=panel)
+    hung = surface.texels.object_index() >= PANEL
+    shown = np.where(hung[:, None], np.median(lit[~hung], axis=0), lit).astype(np.float32)
+    coverage = CoverageMap.of(~hung, 0 * hung > 0)
+    seen = _seen(
+        (directions_of_pixels(HEIGHT, WIDTH, True)[..., 1] > 0.5) & (_UP > 0) & (_UP < 0.5)
+    )
+    seen = replace(seen, radiance=seen.radiance / 4)
+    found = light_from_outside(surface, shown, coverage, seen, True, 0)
+    assert found is not None
+    assert found.lamps.tolist() == [PANEL] * (panel > 0)
+    sky, true_sky = _of_upper_half(found.environment.image), _of_upper_half(SKY / 4)
+    np.testing.assert_allclose(sky, true_sky, rtol=0.35)
+    lamps = lamps_that_explain(
+        surface, shown, coverage, FRAMES, found.environment, 0, dict.fromkeys(found.lamps, True)
+    )
+    assert lamps.object.tolist() == found.lamps.tolist()
+    np.testing.assert_allclose(lamps.radiance, panel, rtol=0.25)
 
 
 def test_no_sun_is_found_where_none_shines(yard):

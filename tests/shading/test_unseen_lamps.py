@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light
-from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved
 from usdbrdf.shading.shaded import find_emitters
 from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
@@ -23,6 +21,7 @@ from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
 from usdbrdf.transport.lights import lights_from_radiance
 from usdbrdf.transport.lit_scene import TexturedScene
 
+DARK = black_environment()
 RADIANCE = np.array([20.0, 16.0, 11.0])
 LAMP, SHELF = 5, 6
 # From one corner to the others.
@@ -84,7 +83,7 @@ def _photographed(hall, radiance: np.ndarray, index: int):
 
 def test_the_lamp_that_no_frame_shows_is_found_with_its_radiance(hall):
     surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
-    found = lamps_that_explain(surface, lit, coverage, FRAMES, 0)
+    found = lamps_that_explain(surface, lit, coverage, FRAMES, DARK, 0)
     assert found.object.tolist() == [LAMP]
     np.testing.assert_allclose(found.radiance[0], RADIANCE, rtol=0.2)
     assert found.error[0] < 0.2
@@ -109,7 +108,7 @@ def test_so_is_one_that_is_as_small_as_it_is_bright():
     # A thumb's width: one of a million rays that look around would meet it.
     bright = RADIANCE * (1.2 / 0.02) ** 2
     surface, lit, coverage = _photographed(_hall(0.02), bright, LAMP)
-    found = lamps_that_explain(surface, lit, coverage, FRAMES, 0)
+    found = lamps_that_explain(surface, lit, coverage, FRAMES, DARK, 0)
     assert found.object.tolist() == [LAMP]
     np.testing.assert_allclose(found.radiance[0], bright, rtol=0.2)
 
@@ -121,7 +120,7 @@ def test_what_hangs_below_a_lamp_is_not_taken_for_it():
     small = surface.texels.object_index() >= len(hall.texels.resolution) - 6
     lit = np.where(small[:, None], np.median(lit[~small], axis=0), lit).astype(np.float32)
     coverage = CoverageMap.of(coverage.observed & ~small, np.zeros(len(small), np.bool_))
-    found = lamps_that_explain(surface, lit, coverage, FRAMES, 0)
+    found = lamps_that_explain(surface, lit, coverage, FRAMES, DARK, 0)
     assert found.object.tolist() == [LAMP]
     np.testing.assert_allclose(found.radiance[0], RADIANCE, rtol=0.2)
 
@@ -131,7 +130,7 @@ def test_a_lamp_is_told_by_what_lies_evenly_in_its_light(hall, monkeypatch):
     shown = _blurred(surface.texels, lit)
 
     def off() -> float:
-        found = lamps_that_explain(surface, shown, coverage, FRAMES, 0)
+        found = lamps_that_explain(surface, shown, coverage, FRAMES, DARK, 0)
         return float(np.abs(found.radiance[0] / RADIANCE - 1).max())
 
     even = off()
@@ -160,9 +159,7 @@ def test_so_is_a_lamp_that_clips(hall, tmp_path: Path, monkeypatch: pytest.Monke
 
     def off(name: str) -> float:
         run = TaskRun(tmp_path, "shade", tmp_path / name)
-        light = estimate_clipped_light(
-            run, surface, shown, coverage, FRAMES, black_environment(), 0
-        )
+        light = estimate_clipped_light(run, surface, shown, coverage, FRAMES, DARK, 0)
         assert light.estimate.determined.all()
         return float(np.abs(light.lit[clipped][0] / RADIANCE - 1).max())
 
@@ -181,15 +178,17 @@ def test_a_lamp_that_clips_is_unknown_meanwhile(hall):
     seen, clipped = ~np.isin(owner, (LAMP, SHELF)), owner == SHELF
     shown = np.where(seen[:, None], lit + by_shelf, lit)
     shown[clipped] = RADIANCE.max() / 4
-    found = lamps_that_explain(surface, shown, CoverageMap.of(seen, clipped), FRAMES, 0)
+    found = lamps_that_explain(surface, shown, CoverageMap.of(seen, clipped), FRAMES, DARK, 0)
     assert found.object.tolist() == [LAMP]
     np.testing.assert_allclose(found.radiance[0], RADIANCE, rtol=0.25)
 
 
 def test_what_a_person_says_of_an_object_holds(hall):
     surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
-    assert not len(lamps_that_explain(surface, lit, coverage, FRAMES, 0, {LAMP: False}).object)
-    said = lamps_that_explain(surface, lit, coverage, FRAMES, 0, {LAMP: True})
+    assert not len(
+        lamps_that_explain(surface, lit, coverage, FRAMES, DARK, 0, {LAMP: False}).object
+    )
+    said = lamps_that_explain(surface, lit, coverage, FRAMES, DARK, 0, {LAMP: True})
     assert said.object.tolist() == [LAMP]
     clipped = surface.texels.object_index() == SHELF
     coverage = CoverageMap.of(coverage.observed & ~clipped, clipped)
@@ -198,24 +197,10 @@ def test_what_a_person_says_of_an_object_holds(hall):
         assert groups.lamp.tolist() == [shines]
 
 
-def test_light_from_outside_that_is_inferred_and_such_lamps_are_not_told_apart(hall, monkeypatch):
-    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
-    monkeypatch.setattr("usdbrdf.shading.unseen_lamps._MOST_OPEN", -1.0)
-
-    def found(outside: Outside | None) -> list[int]:
-        lamps = lamps_that_explain(surface, lit, coverage, FRAMES, 0, outside=outside)
-        return [int(index) for index in lamps.object]
-
-    known = Outside.given(black_environment())
-    assert found(None) == []
-    assert found(replace(known, open_share=0.1, sky_error=0.3)) == []
-    assert found(known) == [LAMP]
-
-
 def test_what_only_reflects_is_none(hall):
     # The lamp is a wall that frames show.
     surface, lit, coverage = _photographed(hall, RADIANCE / 4, 1)
-    found = lamps_that_explain(surface, lit, coverage, FRAMES, 0)
+    found = lamps_that_explain(surface, lit, coverage, FRAMES, DARK, 0)
     assert not len(found.object)
     assert found.with_light(surface.texels, lit) is lit
     assert not len(UnseenLamps.none().error)

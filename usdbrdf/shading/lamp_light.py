@@ -138,7 +138,7 @@ def beside_others(asked: Asked, sources: Sources, found: Solution) -> tuple[Doub
 def shining(radiance: Double, near: Double, part: Double) -> Bool:
     """Which (K,) are clearly brighter than what only reflects, even with as much light as the
     texels that see it receive; near and part (K,) as of ``Strengths``."""
-    return (np.pi * radiance.mean(axis=1) > _BRIGHTER * near) & (part > LEAST_PART)
+    return np.asarray((np.pi * radiance.mean(axis=1) > _BRIGHTER * near) & (part > LEAST_PART))
 
 
 def brought(

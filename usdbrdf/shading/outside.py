@@ -19,7 +19,7 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
+from usdbrdf.model.arrays import Array, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading.asked import (
@@ -29,22 +29,21 @@ from usdbrdf.shading.asked import (
     asked_texels,
     first_of_segments,
     irradiance_of_texels,
-    looked_around,
 )
 from usdbrdf.shading.gloss import Mirrored, mirroring
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
 from usdbrdf.shading.lamp_light import Lamps, beside_others, brought, shining, sources_of, without
 from usdbrdf.shading.likely_lamps import beside_daylight
 from usdbrdf.shading.outside_light import Asked, Solution, Sources, jackknife, levelled, solved
+from usdbrdf.shading.sky_patches import (
+    patches_of_sky,
+    picture_of_sky,
+    shares_of_sky,
+    sources_in_sky,
+)
 from usdbrdf.shading.sun_direction import find_sun
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
-from usdbrdf.transport.environment import (
-    NO_SUN,
-    Environment,
-    Sun,
-    directions_of_pixels,
-    pixels_of_directions,
-)
+from usdbrdf.transport.environment import NO_SUN, Environment, Sun
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.sunlight import sunlit
 
@@ -57,20 +56,12 @@ _MANY_PER_SEGMENT, _AROUND, _AS_SUNLIT = 960, 2, 0.05
 _LOOKS_AT_MIRRORED, _AS_TOLD = 2, (1.0, 0.0)
 # Where more of the sunlit texels are clear of shadows than this, all of them tell more.
 _MOSTLY_CLEAR = 0.5
-# Lower and upper elevation of a band of patches, degrees, and their number.
-_BANDS = (
-    (-90, -30, 4), (-30, 0, 12), (0, 8, 24), (8, 16, 24), (16, 28, 24), (28, 42, 16), (42, 65, 8),
-    (65, 90, 1),
-)  # fmt: skip
 _LEAST_SHARE = calibration.number("outside.least_share")
 _LEAST_OPEN = calibration.number("outside.least_open")
 _HIDDEN_BY_NIGHT = calibration.number("outside.hidden_by_night")
 # Of a sky that no frame shows: through a slit it is believed in only if that much is known of it.
 _SLIT = calibration.number("outside.slit")
 _MOST_SKY_ERROR = calibration.number("outside.most_sky_error")
-_BESIDE = calibration.number("outside.alike_within")
-_SEED = 0x51C4
-_DARKEST = 1e-3  # of what is usual: darker sky is none
 _DARK = 1e-4  # of what is reflected: less than that is no light to compare with
 
 
@@ -191,107 +182,79 @@ def light_from_outside(
     measured, clipped = seen.coverage.measured, seen.coverage.clipped
     # What long exposures alone show may be no brighter than the rest.
     limit = seen.radiance.max(axis=1) * clipped
-    patches = _patches(limit > limit.max() / 2, z_up)
-    unseen = np.where(measured, -1, patches)
+    patches = patches_of_sky(limit > limit.max() / 2, z_up)
+    none = np.zeros(0, np.int64)
+    look = _Look(surface, lit, coverage, seen, patches, none, z_up, seed, mirrored)
     # A look around first: of a closed room a few rays tell that it is.
     for rays in (_FIRST_RAYS, _RAYS):
-        share, open_share = _shares(surface, asked, unseen, z_up, seed, rays)
+        share, open_share = look.shares(asked, rays)
         if open_share < _LEAST_OPEN:
             return None
     say(f"shade: {100 * open_share:.0f} % of the light's directions leave the scan")
+    confidence = seen.coverage.stored().reshape(HEIGHT, WIDTH)
     hidden = float(share.mean(axis=1).sum()) / np.pi
     if (
         seen.is_night() and hidden < _HIDDEN_BY_NIGHT * open_share
     ):  # as all that is seen, so the rest
-        radiance = _picture(seen, patches, np.zeros(0, np.int64), np.zeros((0, 3)), z_up)
-        confidence = seen.coverage.stored().reshape(HEIGHT, WIDTH)
-        environment = Environment(radiance, z_up)
-        return Outside(environment=environment, confidence=confidence, open_share=open_share)
-    used = np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi)
-    look = _Look(surface, lit, seen, patches, used, z_up, seed)
-    look, lamps, all_told = _with_lamps(look, asked, share, coverage, said)
-    asked, sky, sun, with_sun, found = all_told
-    light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
+        as_seen = look.picture(np.zeros((0, 3)))
+        return Outside(environment=as_seen, confidence=confidence, open_share=open_share)
+    look = look._replace(used=np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi))
+    look, lamps, told = _with_lamps(look, asked, share, said)
     if mirrored is not None:
-        for _ in range(_LOOKS_AT_MIRRORED):
-            strengths: Double = np.exp(found.log_radiance)
-            outside = Environment(look.picture(strengths), z_up)
-            in_sun = outside.under(sun._replace(irradiance=strengths[-1]))
-            asked = asked._replace(mirrored=mirrored(in_sun, asked.texel))
-            sky = sky._replace(gloss=_AS_TOLD)
-            with_sun = _with_sun(surface, asked, sky, sun, seed)
-            found = solved(*with_sun)
-        light = asked.irradiance + sky.irradiance(found.log_radiance[:-1])
-    strength = float(np.exp(found.log_radiance[-1]).mean() / np.median(light.mean(axis=1)))
-    error = jackknife(*with_sun, found)
-    # What no texel sees keeps what was thought of it before, and errs by nothing.
-    sees = np.count_nonzero(with_sun[1].share[-1]) >= LEAST_OF_SEGMENT
-    shines = sees and error[-1].max() < _MOST_SUN_ERROR and strength > _LEAST_SUN
-    if shines:
-        many = asked_texels(surface.texels, lit, coverage, seed, _MANY_PER_SEGMENT)
-        assert many is not None
-        if (clear := _clearly_lit(surface, many, sun, seed)) is not None:
-            share, _ = _shares(surface, clear, unseen, z_up, seed, _RAYS)
-            clear, of_clear = look.at(clear, share)
-            if mirrored is not None:
-                clear = clear._replace(mirrored=mirrored(in_sun, clear.texel))
-            # As those before told it.
-            of_clear = sky._replace(share=of_clear.share)
-            clearly = _with_sun(surface, clear, of_clear, sun, seed)
-            told = solved(*clearly)
-            own_error = jackknife(*clearly, told)
-            if own_error[-1].max() < _MOST_CLEAR_ERROR:
-                with_sun, found, error = clearly, told, own_error
-        found = levelled(*with_sun, found)
-        sun = sun._replace(irradiance=np.exp(found.log_radiance[-1]))
-    else:
-        if mirrored is not None:
-            asked = asked._replace(mirrored=mirrored(outside, asked.texel))
-        sun, found = NO_SUN, solved(asked, sky)
-        found, error = levelled(asked, sky, found), jackknife(asked, sky, found)
-    radiance_of_sky = np.exp(found.log_radiance[: len(used)])
-    radiance = look.picture(radiance_of_sky)
+        told = _beside_mirrored(look, told)
+    error = jackknife(*told.with_sun, told.found)
+    sun_shines = _sun_shines(told, error)
+    told, error = _clear_of_shadows(look, told, error) if sun_shines else _sunless(look, told)
+    found = levelled(*told.with_sun, told.found)
+    sky, of_sky = np.exp(found.log_radiance[: len(look.used)]), error[: len(look.used)].max(axis=1)
     # By the light that each brings: nobody asks how dark dark ground is.
-    weight = share[used].mean(axis=1) * radiance_of_sky.mean(axis=1)
-    of_sky = error[: len(used)].max(axis=1)
-    sky_error = float(np.average(of_sky, weights=weight)) if len(used) else math.nan
-    invented = not measured.any() and not shines and not sky_error < _MOST_SKY_ERROR
+    weight = told.sources.share[: len(look.used)].mean(axis=1) * sky.mean(axis=1)
+    sky_error = float(np.average(of_sky, weights=weight)) if len(look.used) else math.nan
+    invented = not measured.any() and not sun_shines and not sky_error < _MOST_SKY_ERROR
     if invented and open_share < _SLIT:
         return None
+    sun = told.sun._replace(irradiance=np.exp(found.log_radiance[-1])) if sun_shines else NO_SUN
     return Outside(
-        environment=Environment(radiance, z_up).under(sun),
-        confidence=seen.coverage.stored().reshape(HEIGHT, WIDTH),
+        environment=look.picture(sky).under(sun),
+        confidence=confidence,
         open_share=open_share,
         sky_error=sky_error,
-        sun_error=float(error[-1].max()) if shines else math.nan,
+        sun_error=float(error[-1].max()) if sun_shines else math.nan,
         lamps=lamps,
     )
 
 
 class _Look(NamedTuple):
-    """How a scan of radiance ``lit`` (T, 3) is asked for light from outside: by what was ``seen``
-    of it, by those of the patches (D,) of all directions that are ``used``, and by lamps beside it.
-    """
+    """How a scan of radiance ``lit`` (T, 3) and its coverage is asked for light from outside: by
+    what was ``seen`` of it, by those of the patches (D,) of all directions that are ``used``, and
+    by lamps beside it; and what surfaces mirror to the frames, None for nothing."""
 
     surface: TexturedScene
     lit: Float
+    coverage: CoverageMap
     seen: Surroundings
     patches: Int
     used: Long
     z_up: bool
     seed: int
+    mirrored: Mirrored | None
     lamps: Lamps | None = None
+
+    def shares(self, asked: Asked, rays: int = _RAYS) -> tuple[Double, float]:
+        """As of ``shares_of_sky``, of the patches where nothing was measured."""
+        unseen = np.where(self.seen.coverage.measured, -1, self.patches)
+        return shares_of_sky(self.surface, asked, unseen, self.z_up, self.seed, rays)
 
     def at(self, asked: Asked, share: Double) -> tuple[Asked, Sources]:
         """The texels asked with S, W/m^2, of all that frames measured, and the other sources: those
         of the patches, of which all bring ``share`` (P, N), and the lamps."""
         surface, environment = self.surface, _of_measured(self.seen, self.z_up)
         lit = self.lit if self.lamps is None else without(self.lit, self.lamps)
-        shining = Shining.of(surface, lit, environment)
-        irradiance = irradiance_of_texels(surface, shining, environment, asked.texel, self.seed)
+        lights = Shining.of(surface, lit, environment)
+        irradiance = irradiance_of_texels(surface, lights, environment, asked.texel, self.seed)
         least = _DARK * np.median(asked.reflected)
         asked = asked._replace(irradiance=np.maximum(irradiance, least).astype(np.float64))
-        sky = _sky(asked, self.seen, self.patches, share, self.used, self.z_up)
+        sky = sources_in_sky(asked, self.seen, self.patches, share, self.used, self.z_up)
         if self.lamps is None:
             return asked, sky
         lamps = sources_of(self.lamps, brought(surface, self.lamps, asked.texel, self.seed))
@@ -302,10 +265,16 @@ class _Look(NamedTuple):
             bound=np.append(sky.bound, lamps.bound),
         )
 
-    def picture(self, radiance: Double) -> Float:
-        """(HEIGHT, WIDTH, 3): what was measured, and the patches, whose radiance comes first."""
+    def picture(self, radiance: Double) -> Environment:
+        """What was measured, and the patches, whose radiance comes first; without the sun."""
         radiance = radiance[: len(self.used)]
-        return _picture(self.seen, self.patches, self.used, radiance, self.z_up)
+        picture = picture_of_sky(self.seen, self.patches, self.used, radiance, self.z_up)
+        return Environment(picture, self.z_up)
+
+    def under_sun(self, told: _Told) -> Environment:
+        """What was told, with the sun."""
+        radiance: Double = np.exp(told.found.log_radiance)
+        return self.picture(radiance).under(told.sun._replace(irradiance=radiance[-1]))
 
 
 class _Told(NamedTuple):
@@ -318,19 +287,21 @@ class _Told(NamedTuple):
     with_sun: tuple[Asked, Sources]
     found: Solution
 
+    def light(self) -> Double:
+        """(N, 3) S of the texels asked, in the shade."""
+        return self.asked.irradiance + self.sources.irradiance(self.found.log_radiance[:-1])
+
 
 def _with_lamps(
-    look: _Look, asked: Asked, share: Double, coverage: CoverageMap, said: Mapping[int, bool]
+    look: _Look, asked: Asked, share: Double, said: Mapping[int, bool]
 ) -> tuple[_Look, Long, _Told]:
     """How the scan is asked for daylight and for what shines beside it, the numbers of the objects
     among these, and what it tells."""
     told = _told(look, asked, share)
     # Lamps beside it would brighten the sky, and all the less the farther they are: as it is, it
     # does not explain them.
-    picture = Environment(look.picture(np.exp(told.found.log_radiance)), look.z_up)
-    under_sun = picture.under(told.sun._replace(irradiance=np.exp(told.found.log_radiance[-1])))
     beside = beside_daylight(
-        look.surface, look.lit, coverage, under_sun, told.asked, look.seed, said
+        look.surface, look.lit, look.coverage, look.under_sun(told), told.asked, look.seed, said
     )
     while len(beside):
         lamps = beside.lamps(look.surface.texels)
@@ -356,11 +327,63 @@ def _told(look: _Look, asked: Asked, share: Double) -> _Told:
     light, sun = asked.irradiance + sources.irradiance(sources.mean), None
     for _ in range(3):
         sun = find_sun(look.surface, asked, light, look.z_up, sun)
-        with_sun = _with_sun(look.surface, asked, sources, sun, look.seed)
-        found = solved(*with_sun)
-        light = asked.irradiance + sources.irradiance(found.log_radiance[:-1])
-    assert sun is not None
-    return _Told(asked, sources, sun, with_sun, found)
+        told = _solved(look, asked, sources, sun)
+        light = told.light()
+    return told
+
+
+def _solved(look: _Look, asked: Asked, sources: Sources, sun: Sun) -> _Told:
+    with_sun = _with_sun(look.surface, asked, sources, sun, look.seed)
+    return _Told(asked, sources, sun, with_sun, solved(*with_sun))
+
+
+def _beside_mirrored(look: _Look, told: _Told) -> _Told:
+    """The same where surfaces mirror what was told."""
+    assert look.mirrored is not None
+    for _ in range(_LOOKS_AT_MIRRORED):
+        seen = look.mirrored(look.under_sun(told), told.asked.texel)
+        sources = told.sources._replace(gloss=_AS_TOLD)
+        told = _solved(look, told.asked._replace(mirrored=seen), sources, told.sun)
+    return told
+
+
+def _sun_shines(told: _Told, error: Double) -> bool:
+    """error (K, 3): of the sources with the sun."""
+    strength = float(np.exp(told.found.log_radiance[-1]).mean())
+    strength /= float(np.median(told.light().mean(axis=1)))
+    # What no texel sees keeps what was thought of it before, and errs by nothing.
+    sees = np.count_nonzero(told.with_sun[1].share[-1]) >= LEAST_OF_SEGMENT
+    return bool(sees and error[-1].max() < _MOST_SUN_ERROR and strength > _LEAST_SUN)
+
+
+def _sunless(look: _Look, told: _Told) -> tuple[_Told, Double]:
+    """The same without the sun, and the errors."""
+    asked = told.asked
+    if look.mirrored is not None:
+        sky = look.picture(np.exp(told.found.log_radiance))
+        asked = asked._replace(mirrored=look.mirrored(sky, asked.texel))
+    without_sun = asked, told.sources
+    found = solved(*without_sun)
+    told = told._replace(asked=asked, sun=NO_SUN, with_sun=without_sun, found=found)
+    return told, jackknife(*without_sun, found)
+
+
+def _clear_of_shadows(look: _Look, told: _Told, error: Double) -> tuple[_Told, Double]:
+    """The same by texels that lie clear of shadows' edges, and the errors, if these tell the sun
+    well."""
+    many = asked_texels(look.surface.texels, look.lit, look.coverage, look.seed, _MANY_PER_SEGMENT)
+    assert many is not None
+    clear = _clearly_lit(look.surface, many, told.sun, look.seed)
+    if clear is None:
+        return told, error
+    clear, sources = look.at(clear, look.shares(clear)[0])
+    if look.mirrored is not None:
+        clear = clear._replace(mirrored=look.mirrored(look.under_sun(told), clear.texel))
+    # As those before told it.
+    sources = told.sources._replace(share=sources.share)
+    by_clear = _solved(look, clear, sources, told.sun)
+    own_error = jackknife(*by_clear.with_sun, by_clear.found)
+    return (by_clear, own_error) if own_error[-1].max() < _MOST_CLEAR_ERROR else (told, error)
 
 
 def _of_measured(seen: Surroundings, z_up: bool) -> Environment:
@@ -391,78 +414,10 @@ def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> A
     return asked.of(np.sort(np.concatenate(halves)))
 
 
-def _patches(clipped: Bool, z_up: bool) -> Int:
-    """(D,) the patch of the sky of each direction: bands of azimuths; what clips is in patches of
-    its own, whose numbers follow."""
-    directions = directions_of_pixels(HEIGHT, WIDTH, z_up).reshape(-1, 3)
-    up, x = directions[:, 2 if z_up else 1], directions[:, 0]
-    ahead = -directions[:, 1] if z_up else directions[:, 2]
-    elevation, turn = np.degrees(np.arcsin(np.clip(up, -1, 1))), np.arctan2(x, ahead) / (2 * np.pi)
-    patch, first = np.zeros(len(directions), np.int32), 0
-    for low, high, count in _BANDS:
-        band = (elevation >= low) & (elevation <= high)
-        patch[band] = first + np.floor((turn[band] % 1.0) * count).astype(np.int32) % count
-        first += count
-    return np.where(clipped, patch + first, patch).astype(np.int32)
-
-
-_PATCHES = sum(count for _, _, count in _BANDS)
-
-
-def _shares(
-    surface: TexturedScene, asked: Asked, patches: Int, z_up: bool, seed: int, rays: int
-) -> tuple[Double, float]:
-    """By so many rays from each, what a patch (-1: none) of radiance 1 brings to the texels asked,
-    (2 _PATCHES, N), W/m^2; and the share of the light's directions that leave the scan."""
-    count = len(asked.texel)
-    towards, face = looked_around(surface, asked.texel, seed ^ _SEED, rays)
-    out = np.flatnonzero(face < 0)
-    patch = patches[pixels_of_directions(towards[out], HEIGHT, WIDTH, z_up)]
-    texel, kept = out % count, patch >= 0
-    met = np.bincount(patch[kept] * count + texel[kept], minlength=2 * _PATCHES * count)
-    brought = np.asarray(np.pi / rays * met.reshape(2 * _PATCHES, count), np.float64)
-    return brought, len(out) / len(towards)
-
-
-_ABOVE_LIMIT = calibration.pair("outside.above_limit")
-_SKY_DEVIATION = calibration.number("outside.sky_deviation")
-_ALIKE = calibration.number("outside.alike")
-_ALIKE_OVER_HORIZON = calibration.number("outside.alike_over_horizon")
 _SUN_DEVIATION = calibration.number("outside.sun_deviation")
 _LEAST_SUN = calibration.number("outside.least_sun")
 _MOST_SUN_ERROR = calibration.number("outside.most_sun_error")
 _MOST_CLEAR_ERROR = calibration.number("outside.most_clear_error")
-
-
-def _sky(
-    asked: Asked, seen: Surroundings, patches: Int, share: Double, used: Long, z_up: bool
-) -> Sources:
-    """The patches that light what is asked."""
-    known, usual = seen.coverage.measured, seen.trend(z_up)
-    # Where all is dark that was seen, but not all that lights the scan was, the rest is not.
-    if not usual.any() or seen.is_night():
-        usual = np.tile(np.median(asked.reflected, axis=0) / np.pi, (len(usual), 1))
-    bound = used >= _PATCHES
-    darkest = max(_DARKEST * float(np.median(usual.max(axis=1))), 1e-30)
-    mean = np.zeros((len(used), 3))
-    directions = directions_of_pixels(HEIGHT, WIDTH, z_up).reshape(-1, 3)
-    centre = np.zeros((len(used), 3))
-    for k, patch in enumerate(used):
-        centre[k] = directions[patches % _PATCHES == patch % _PATCHES].mean(axis=0)
-        near = known & (directions @ centre[k] > np.cos(_BESIDE) * np.linalg.norm(centre[k]))
-        if bound[k]:
-            mean[k] = np.log(seen.radiance[patches == patch].max(axis=0)) + _ABOVE_LIMIT[0]
-        elif near.any():
-            mean[k] = np.log(np.maximum(np.median(seen.radiance[near], axis=0), darkest))
-        else:
-            mean[k] = np.log(np.maximum(usual[patches == patch], darkest)).mean(axis=0)
-    centre /= np.linalg.norm(centre, axis=1, keepdims=True)
-    near = np.argwhere(np.triu(centre @ centre.T > np.cos(_BESIDE), 1))
-    near = near[~bound[near].any(axis=1)]
-    below = centre[:, 2 if z_up else 1] < 0
-    apart = np.where(below[near[:, 0]] == below[near[:, 1]], _ALIKE, _ALIKE_OVER_HORIZON)
-    deviation = np.where(bound, _ABOVE_LIMIT[1], _SKY_DEVIATION)
-    return Sources(share[used], mean, deviation, bound, near, apart)
 
 
 def _with_sun(
@@ -484,13 +439,3 @@ def _with_sun(
         gloss=sky.gloss,
     )
     return asked.of(kept), sources
-
-
-def _picture(seen: Surroundings, patches: Int, used: Long, radiance: Double, z_up: bool) -> Float:
-    """(HEIGHT, WIDTH, 3): what was measured, and the patches."""
-    filled = seen.trend(z_up)
-    for patch, value in zip(used, radiance, strict=True):
-        filled[patches == patch] = value
-    filled = np.where(seen.coverage.clipped[:, None], np.maximum(filled, seen.radiance), filled)
-    known = seen.coverage.measured[:, None]
-    return np.where(known, seen.radiance, filled).reshape(HEIGHT, WIDTH, 3).astype(np.float32)
