@@ -62,6 +62,8 @@ _HIDDEN_BY_NIGHT = calibration.number("outside.hidden_by_night")
 # Of a sky that no frame shows: through a slit it is believed in only if that much is known of it.
 _SLIT = calibration.number("outside.slit")
 _MOST_SKY_ERROR = calibration.number("outside.most_sky_error")
+# The relative error of a lamp beside daylight of which hardly its order is known.
+_MOST_OF_LAMP = 1.0
 _DARK = 1e-4  # of what is reflected: less than that is no light to compare with
 
 
@@ -310,6 +312,8 @@ def _with_lamps(
         of_objects = slice(len(look.used), len(look.used) + len(beside.likely.object))
         near, part = beside_others(*told.with_sun, told.found)
         shines = shining(np.exp(told.found.log_radiance), near, part)[of_objects]
+        if shines.any():
+            shines &= jackknife(*told.with_sun, told.found)[of_objects].max(axis=1) < _MOST_OF_LAMP
         shines |= lamps.certain[: len(shines)]
         if shines.all():
             return look, beside.likely.object, told
