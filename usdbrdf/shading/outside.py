@@ -62,8 +62,7 @@ _HIDDEN_BY_NIGHT = calibration.number("outside.hidden_by_night")
 # Of a sky that no frame shows: through a slit it is believed in only if that much is known of it.
 _SLIT = calibration.number("outside.slit")
 _MOST_SKY_ERROR = calibration.number("outside.most_sky_error")
-# The relative error of a lamp beside daylight of which hardly its order is known.
-_MOST_OF_LAMP = 1.0
+_MOST_OF_LAMP = calibration.number("unseen.most_beside")
 _DARK = 1e-4  # of what is reflected: less than that is no light to compare with
 
 
