@@ -196,6 +196,7 @@ ENGINEERING: dict[str, str] = {
     "_BENT": "geometry: what is a seam",
     "_BESIDE": "geometry: pixels that show one surface",
     "_BESIDE_MIDDLE": "geometry: bound of how far a place of a texel lies off its middle",
+    "_BESIDE_RIM": "pixels that JPEG mixes",
     "_BETTER": "numerics: share of differing bits",
     "_BLOCKS": "blocks of a jackknife",
     "_BRIGHTEST": "steps of a search",

@@ -78,6 +78,7 @@ def scan_of_shots(
     how: str,
     up_axis: str | None = None,
     in_metres: bool = False,
+    rim: bool = False,
 ) -> Scan:
     """The capture of a document's photographs with the mesh beside them.
 
@@ -86,6 +87,7 @@ def scan_of_shots(
                     them
     meshes, how     patterns of the program's own names, and what to do where there is no mesh
     up_axis         None where the format does not say
+    rim             what is black along the pictures' borders is no part of them
     in_metres       False where the unit is that of the reconstruction, which nobody knows
     """
     if not in_metres and options.meters_per_unit is None:
@@ -114,6 +116,7 @@ def scan_of_shots(
                 resolution=shot.camera.resolution,
                 lens=shot.camera.lens if shot.camera.lens.bends else PINHOLE,
                 mask_path=pictures.mask_of(image, folder, options),
+                rim=rim,
             )
         )
     records.sort(key=lambda record: record.image_path)
