@@ -13,7 +13,6 @@ from usdbrdf.options import IngestOptions
 
 DOCUMENTS = [
     ("castle.nvm", "NVM_V3\n\n11\n", "VisualSFM", "COLMAP"),
-    ("bundle.rd.out", "# Bundle file v0.3\n2 9\n", "Bundler", "COLMAP"),
     ("castle.baf", "1\n11\n", "Meshroom", "cameras.sfm"),
     ("castle.mg", '{"header": {}}', "Meshroom", "cameras.sfm"),
     ("sfm_data.bin", "\x00", "OpenMVG", "ConvertSfM_DataFormat"),
@@ -61,7 +60,6 @@ DOCUMENTS = [
     ("shot.ma", "//Maya ASCII 2024 scene\n", "Maya", "as USD"),
     ("shot.c4d", "QC4D", "Cinema 4D", "as USD"),
     ("shot.chan", "1 0 0 0 0 0 0 50\n", "Nuke", "as USD"),
-    ("bundle.out", "2 9\n1 0 0\n", "Bundler", "COLMAP"),
     ("database.db", "SQLite format 3\x00", "COLMAP", "colmap mapper"),
 ]
 

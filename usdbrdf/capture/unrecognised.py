@@ -66,8 +66,6 @@ _PROGRAMS = (
         f"Write them as trajectory.json, with the lens, and read them with {_EXAMPLE}",
     ),
     _Program("VisualSFM", (".nvm",), (), rb"NVM_V3", _ANEW),
-    # What says nothing but .out, its suffix, may be a text of any kind.
-    _Program("Bundler", ("bundle.out",), (), rb"# Bundle file", _ANEW),
     _Program(
         "Polycam", (), (), rb'"t_00"',
         "Name the whole folder of its raw data, which holds keyframes/, raw.glb and mesh_info.json",
