@@ -37,12 +37,7 @@ DOCUMENTS = [
     ("room.psx", '<document version="1.2.0"/>', "Metashape", "Export Cameras"),
     ("room.rcproj", "<RealityCaptureProject/>", "RealityScan", "camera parameters"),
     ("scene.mvs", "MVS", "OpenMVS", "COLMAP"),
-    (
-        "at.xml",
-        '<?xml version="1.0"?>\n<BlocksExchange version="2.1">',
-        "ContextCapture",
-        "Agisoft",
-    ),
+    ("at.xmz", "PK\x03\x04", "ContextCapture", "Unzip it"),
     ("opk.txt", "# Label X Y Z Omega Phi Kappa\n", "Metashape", "Export Cameras"),
     ("a_calibrated_camera_parameters.txt", "fileName imageWidth", "Pix4D", "COLMAP"),
     ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n", "Stray Scanner", "fuse the"),

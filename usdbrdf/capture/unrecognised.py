@@ -121,9 +121,8 @@ _PROGRAMS = (
     ),
     _Program("OpenMVS", (".mvs",), (), _NOTHING, _ANEW),
     _Program(
-        "ContextCapture", (), (), rb"<BlocksExchange",
-        "From Metashape export them as Agisoft XML, of other programs reconstruct the same "
-        "photographs with COLMAP",
+        "ContextCapture", (".xmz",), (), _NOTHING,
+        "Unzip it: it holds a BlocksExchange XML, which is read",
     ),
     _Program(
         "Metashape", (), (), rb"(?mi)^#.*\bomega\b.*\bphi\b.*\bkappa\b",
