@@ -39,7 +39,7 @@ DOCUMENTS = [
     ("scene.mvs", "MVS", "OpenMVS", "COLMAP"),
     ("at.xmz", "PK\x03\x04", "ContextCapture", "Unzip it"),
     ("opk.txt", "# Label X Y Z Omega Phi Kappa\n", "Metashape", "Export Cameras"),
-    ("a_calibrated_camera_parameters.txt", "fileName imageWidth", "Pix4D", "COLMAP"),
+    ("a_calibrated_external_camera_parameters.txt", "imageName X", "Pix4D", "1_initial/params/"),
     ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n", "Stray Scanner", "fuse the"),
     ("pano-poses.csv", "# pano poses v1.0: ID; filename", "NavVis", "EQUIRECTANGULAR"),
     ("00000000_cam.txt", "extrinsic\n1 0 0 0\n", "MVSNet", "a transforms.json"),

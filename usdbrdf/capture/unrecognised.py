@@ -129,9 +129,8 @@ _PROGRAMS = (
         "Export them as Agisoft XML (File > Export > Export Cameras), which has the lens too",
     ),
     _Program(
-        "Pix4D",
-        (".p4d", "camera_parameters.txt", "pmatrix.txt"),
-        (), _NOTHING, _ANEW,
+        "Pix4D", (".p4d", "camera_parameters.txt", "camera_parameters.cam", "pmatrix.txt"), (),
+        _NOTHING, "Bring the project's 1_initial/params/*_calibrated_camera_parameters.txt",
     ),
     _Program(
         "Stray Scanner", (), (), rb"\Atimestamp, *frame, *x, *y, *z, *qx",
