@@ -52,6 +52,7 @@ _OTHER_FOLDER = (
 )
 _MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
+_UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
 
 
 def path_in_capture(root: Path, candidate: str, options: CaptureOptions, *, cure: str = "") -> Path:
@@ -377,7 +378,10 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
     others = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in _MESHES]
     if len(others) == 1:
         return contained(folder, others[0].name)
+    unread = [p.name for p in sorted(folder.iterdir()) if p.suffix.lower() in _UNREAD_MESHES]
     said = f"{len(others)} meshes" if others else "no mesh"
+    if unread and not others:
+        said += f" that is read ({unread[0]} is none of {', '.join(_MESHES)})"
     raise InputRefused(f"{folder}: {said}. {how}, or name one with --mesh. [mesh.missing]")
 
 
