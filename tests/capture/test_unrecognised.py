@@ -12,7 +12,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
 
 DOCUMENTS = [
-    ("castle.nvm", "NVM_V3\n\n11\n", "VisualSFM", "COLMAP"),
+    ("castle.nvm", "NVM_V4\n\n11\n", "VisualSFM", "COLMAP"),
     ("castle.baf", "1\n11\n", "Meshroom", "cameras.sfm"),
     ("castle.mg", '{"header": {}}', "Meshroom", "cameras.sfm"),
     ("sfm_data.bin", "\x00", "OpenMVG", "ConvertSfM_DataFormat"),

@@ -65,7 +65,7 @@ _PROGRAMS = (
         "Open3D", (), (), rb"\A\d+\s+\d+\s+\d+[ \t\r]*\n(?:[ \t]*(?:[-+.\de]+\s+){4}){4}",
         f"Write them as trajectory.json, with the lens, and read them with {_EXAMPLE}",
     ),
-    _Program("VisualSFM", (".nvm",), (), rb"NVM_V3", _ANEW),
+    _Program("VisualSFM", (".nvm",), (), rb"NVM_V", _ANEW),
     _Program(
         "Polycam", (), (), rb'"t_00"',
         "Name the whole folder of its raw data, which holds keyframes/, raw.glb and mesh_info.json",
