@@ -130,3 +130,46 @@ def test_the_only_mesh_beside_the_poses_is_theirs(capture):
     (capture.folder / "room.ply").rename(capture.folder / "room.ply.gz")
     with pytest.raises(InputRefused, match=r"no mesh. Put mesh\.ply beside the poses, or name one"):
         read_scan(capture.folder, IngestOptions())
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj"])
+@pytest.mark.parametrize("stated", [{}, {"scale": 0.2, "offset": [0.5, 0.3, 0.8]}])
+def test_meshes_of_instant_ngp_have_their_axes_turned_back(capture, kind, stated):
+    """As save_mesh of marching_cubes.cu writes them: (p - offset) / scale of p = (y, z, x) of
+    scale x + offset."""
+    with edited(capture.manifest) as document:
+        document.update(stated)
+    scale, offset = stated.get("scale", 0.33), np.array(stated.get("offset", [0.5] * 3))
+    inside = (capture.points * scale + offset)[:, [1, 2, 0]]
+    rows = [" ".join(f"{n:.5f}" for n in p) for p in (inside - offset) / scale]
+    (capture.folder / "mesh.ply").unlink()
+    if kind == "ply":
+        head = [
+            "ply", "format ascii 1.0",
+            "comment output from https://github.com/NVlabs/instant-ngp",
+            f"element vertex {len(rows)}", *(f"property float {axis}" for axis in "xyz"),
+            f"element face {len(capture.triangles)}", "property list uchar int vertex_index",
+            "end_header",
+        ]  # fmt: skip
+        faces = [f"3 {a} {b} {c}" for a, b, c in capture.triangles]
+        (capture.folder / "mesh.ply").write_text("\n".join([*head, *rows, *faces, ""]))
+    else:
+        faces = [f"f {a} {b} {c}" for a, b, c in capture.triangles + 1]
+        lines = ["mtllib nerf.mtl", *(f"v {row}" for row in rows), "usemtl nerf", *faces, ""]
+        (capture.folder / "fox.obj").write_text("\n".join(lines))
+    (capture.folder / "objects.json").unlink()
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-4)
+    assert any("is one of instant-ngp's" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize(
+    "stated", [{"aabb": [[0, 0, 0], [1, 1, 1]]}, {"offset": [1, 2]}, {"scale": 0}]
+)
+def test_meshes_of_instant_ngp_that_lie_anywhere_are_refused(capture, stated):
+    with edited(capture.manifest) as document:
+        document.update(stated)
+    mesh = capture.folder / "mesh.obj"
+    mesh.write_text("mtllib nerf.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(InputRefused, match=r"do not say where it lies.*\[mesh\.frame\]$"):
+        read_scan(capture.folder, IngestOptions(mesh=mesh))

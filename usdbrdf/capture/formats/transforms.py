@@ -107,6 +107,7 @@ def _geometry(capture: _Capture, findings: Findings) -> ScanGeometry:
         options,
         findings,
         capture.applied,
+        capture.document,
         meters_per_unit=unit,
     )
 
