@@ -124,6 +124,18 @@ def test_a_statement_that_says_no_frame_is_refused(capture, stated):
         read_scan(capture.folder, IngestOptions())
 
 
+def test_the_points_that_nerfstudio_begins_from_are_no_mesh(capture):
+    points = [" ".join(map(str, p)) for p in capture.points.tolist()]
+    head = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+    head += [*(f"property float {axis}" for axis in "xyz"), "end_header"]
+    (capture.folder / "sparse_pc.ply").write_text("\n".join([*head, *points, ""]))
+    (capture.folder / "mesh.ply").rename(capture.folder / "room.ply")
+    assert len(read_scan(capture.folder, IngestOptions()).mesh.points) == len(capture.points)
+    (capture.folder / "room.ply").unlink()
+    with pytest.raises(InputRefused, match=r"no mesh \(sparse_pc\.ply holds points alone\)\. Put"):
+        read_scan(capture.folder, IngestOptions())
+
+
 def test_the_only_mesh_beside_the_poses_is_theirs(capture):
     (capture.folder / "mesh.ply").rename(capture.folder / "room.ply")
     assert len(read_scan(capture.folder, IngestOptions()).mesh.points) == len(capture.points)
