@@ -58,6 +58,19 @@ def test_the_document_is_the_room(tmp_path, name, listed, line):
     assert scan.adapter == "bundler"
 
 
+def test_folders_of_pmvs_have_their_pictures_undistorted_and_numbered(tmp_path):
+    """The list names the originals, whose lens these cameras do not have."""
+    room = truth().centred()
+    _write(tmp_path, room, _document(room), "bundle.rd.out", "bundle.rd.out.list.txt", "{}.jpg")
+    (tmp_path / "visualize").mkdir()
+    for i in range(10):
+        place = tmp_path / f"visualize/{i:08d}.jpg"
+        (tmp_path / f"images/{i:04d}.jpg").rename(place)
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, room)
+    assert {path.parent.name for path in scan.frames.image_paths} == {"visualize"}
+
+
 def test_a_file_of_its_name_needs_no_remark_at_its_head(tmp_path):
     room = truth().centred()
     _write(tmp_path, room, _document(room, head=""))

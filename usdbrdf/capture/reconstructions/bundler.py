@@ -29,6 +29,8 @@ DESCRIPTION = DESCRIPTIONS[NAME]
 # A camera's rows and their numbers: focal length, k1, k2; rotation; translation.
 _ROWS, _COUNTS = 5, 15
 _LARGEST = 1_000_000  # cameras that a file may announce
+# Where PMVS has the pictures, undistorted and numbered in this order (VisualSFM, COLMAP).
+_UNDISTORTED = "visualize"
 _FOLDER = "bundle"  # where Bundler itself puts them, below its list of pictures
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 
@@ -59,13 +61,15 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         )
     source = documents[0]
     folder = source.parent if path.is_file() else path.resolve()
+    undistorted = (folder / _UNDISTORTED).is_dir()
     return scan_of_shots(
-        shots_of(source, _names(source, folder)),
+        shots_of(source, None if undistorted else _names(source, folder)),
         options,
         findings,
         adapter=NAME,
         source=source,
         folder=folder,
+        pictures_in=(_UNDISTORTED,) if undistorted else (),
         meshes=("mesh.*", "model.*"),
         how="Export the mesh in the frame of these cameras into this folder",
     )
@@ -87,8 +91,8 @@ def _names(source: Path, folder: Path) -> tuple[str, ...]:
     return tuple(re.sub(r"(\s+\d+\s+[-+.\deE]+)$", "", line) for line in lines if line)
 
 
-def shots_of(source: Path, names: tuple[str, ...]) -> list[Shot]:
-    """The photographs of a document."""
+def shots_of(source: Path, names: tuple[str, ...] | None) -> list[Shot]:
+    """The photographs of a document, by their numbers where they have no names."""
     head = number_rows(source, most=1)
     count = int(head[0][0]) if head and len(head[0]) == 2 and 0 <= head[0][0] < _LARGEST else -1
     rows = number_rows(source, most=1 + _ROWS * count)[1:] if count >= 0 else ()
@@ -99,6 +103,8 @@ def shots_of(source: Path, names: tuple[str, ...]) -> list[Shot]:
             f"{max(count, 0)}. It was cut off, or is of another format; export it again. "
             "[capture.format]"
         )
+    if names is None:
+        names = tuple(f"{i:08d}" for i in range(count))
     if len(names) != count:
         raise InputRefused(
             f"{source}: {count} cameras, but {len(names)} pictures in the list beside it, so "
