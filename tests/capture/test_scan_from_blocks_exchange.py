@@ -231,6 +231,15 @@ def test_a_model_in_tiles_or_of_another_system_is_refused(tmp_path):
             read_scan(tmp_path, OPTIONS)
 
 
+@pytest.mark.parametrize(
+    "system", ["LOCAL_CS[&quot;Local (m)&quot;]", "WGS 84 / UTM zone 17N", "PROJCS[&quot;WGS 84"]
+)
+def test_systems_whose_coordinates_are_lengths_are_read(tmp_path, system):
+    room = truth().square()
+    _write(tmp_path, room, _document(room).replace(f">{ENU}<", f">{system}<"))
+    assert_same(read_scan(tmp_path, OPTIONS), room)
+
+
 def test_of_several_blocks_the_one_with_most_poses_is_read(tmp_path):
     room = truth().square()
     other = "<Block><Name>Block_1</Name><Photogroups/></Block><Block><Name>"

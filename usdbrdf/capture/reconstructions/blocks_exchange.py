@@ -33,7 +33,7 @@ _METADATA = "metadata.xml"
 _ABOVE = 3
 _AXES = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
 # Coordinate systems whose coordinates are no lengths along three axes.
-_DEGREES = re.compile(r"EPSG: *(4326|4979)\b|\+proj=longlat|^\s*(WGS ?84|GEOGCS|GEOGCRS)", re.I)
+_DEGREES = re.compile(r"EPSG: *(4326|4979)\b|\+proj=longlat|^\s*(WGS ?84\s*$|GEOG(CS|CRS))", re.I)
 
 
 def matches(path: Path) -> bool:
