@@ -141,8 +141,8 @@ def test_nothing_recognised_says_so_in_a_sentence(tmp_path):
     assert len(str(refusal.value).replace(str(tmp_path), "")) < 250
     with pytest.raises(InputRefused, match=r"no such file.*\[capture.missing\]"):
         read_scan(tmp_path / "nowhere", IngestOptions())
-    with pytest.raises(UsageError, match=r"'bundler' is not installed. Use one of eyeful-tower"):
-        read_scan(tmp_path, IngestOptions(), "bundler")
+    with pytest.raises(UsageError, match=r"'nonesuch' is not installed. Use one of eyeful-tower"):
+        read_scan(tmp_path, IngestOptions(), "nonesuch")
 
 
 @pytest.mark.parametrize(

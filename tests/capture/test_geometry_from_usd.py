@@ -98,6 +98,26 @@ def test_a_mesh_without_faces_is_left_out(capture, tmp_path):
     assert len(scene.objects) == len(capture.names)
 
 
+@pytest.mark.parametrize("scheme", ["none", "catmullClark"])
+def test_holes_are_no_faces(capture, tmp_path, scheme):
+    """Numbers of faces that do not exist are none of any."""
+    stage = Usd.Stage.Open(str(capture.folder / "room.usda"))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/scan/{capture.names[-1]}/surface"))
+    mesh.GetSubdivisionSchemeAttr().Set(scheme)
+    mesh.CreateHoleIndicesAttr([3, 5, -1, 99_999])
+    stage.Save()
+    scan = read_scan(capture.folder, IngestOptions())
+    whole = capture.triangles[capture.face_object == len(capture.names) - 1]
+    left = scan.mesh.triangles[scan.mesh.face_object == len(capture.names) - 1]
+    expected = np.sort(capture.points[np.delete(whole, [3, 5], axis=0)].mean(axis=1), axis=0)
+    found = np.sort(scan.mesh.points[left].mean(axis=1), axis=0)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    asset = Asset(tmp_path / "asset", "asset")
+    ingest(capture.folder, asset, IngestOptions())
+    scene = scene_from_stage(open_weaker(asset, "texturing"))
+    assert len(scene.triangles) == len(capture.triangles) - 2
+
+
 def test_referenced_geometry_is_not_reduced(capture):
     with pytest.raises(UsageError, match=r"--decimate .* \[usage.option\]"):
         read_scan(capture.folder, IngestOptions(decimate=10))

@@ -374,3 +374,79 @@ def test_old_documents_of_nerfstudio_had_turned_the_world(tmp_path):
     scan = read_scan(made.folder, replace(OPTIONS))
     np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera, atol=1e-9)
     assert any("[capture.legacy]" in warning for warning in scan.warnings)
+
+
+def _images_through(made, folder, model, scale=1):
+    camera = camera_of(model, scale)
+    folder.mkdir(parents=True)
+    for i in range(10):
+        write_exr(folder / f"{i:04d}.exr", seen_through(camera, made.world_from_camera[i], made))
+
+
+@pytest.fixture
+def splats(tmp_path):
+    """A scene as gaussian-splatting's convert.py leaves it."""
+    made = capture_through(tmp_path / "scene", "OPENCV")
+    made.manifest.unlink()
+    shutil.rmtree(made.folder / "frames")
+    names = [f"{i:04d}.exr" for i in range(10)]
+    for model, images, sparse in (
+        ("OPENCV", "input", "distorted/sparse/0"),
+        ("PINHOLE", "images", "sparse/0"),
+    ):
+        _images_through(made, made.folder / images, model)
+        write_model(made.folder / sparse, reconstruction(made, [camera_of(model)], names))
+    for k in (2, 4):
+        _images_through(made, made.folder / f"images_{k}", "PINHOLE", 1 / k)
+    return made
+
+
+def _taken(scan):
+    return {(v.photograph if v else p).parent.name for v, p in _with_views(scan)}
+
+
+def _with_views(scan):
+    views = scan.views or [None] * len(scan.frames)
+    return zip(views, scan.frames.image_paths, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("gone", "taken", "bends"),
+    [
+        ((), "images", False),
+        (("input", "distorted"), "images", False),
+        (("images",), "images_2", False),
+        (("images", "images_2", "input", "distorted"), "images_4", False),
+        (("images", "images_2", "images_4"), "input", True),
+        (("images", "images_2", "images_4", "sparse"), "input", True),
+    ],
+)
+def test_folders_as_those_have_them_who_train_splats(splats, gone, taken, bends):
+    """Each model goes with its images: those that were undistorted never with the lens's."""
+    for name in gone:
+        shutil.rmtree(splats.folder / name)
+    scan = read_scan(splats.folder, OPTIONS)
+    assert _taken(scan) == {taken}
+    assert bool(scan.views) == bends
+    scale = {"images_2": 0.5, "images_4": 0.25}.get(taken, 1)
+    if not bends:
+        expected = np.array(CAMERAS["PINHOLE"][2]) * scale
+        np.testing.assert_allclose(scan.frames.intrinsics[0], expected)
+
+
+def test_the_only_folder_that_holds_the_images_is_theirs(splats):
+    for name in ("images_2", "images_4", "input", "distorted"):
+        shutil.rmtree(splats.folder / name)
+    (splats.folder / "work").mkdir()
+    (splats.folder / "images").rename(splats.folder / "work/my pictures")
+    scan = read_scan(splats.folder, OPTIONS)
+    assert _taken(scan) == {"my pictures"}
+    assert any("are taken from work/my pictures/, the only folder" in s for s in scan.warnings)
+    shutil.copytree(splats.folder / "work/my pictures", splats.folder / "work/normals")
+    with pytest.raises(InputRefused, match=r"work/my pictures, work/normals all hold the images"):
+        read_scan(splats.folder, OPTIONS)
+    named = replace(OPTIONS, frames=splats.folder / "work/my pictures")
+    assert _taken(read_scan(splats.folder, named)) == {"my pictures"}
+    shutil.rmtree(splats.folder / "work")
+    with pytest.raises(InputRefused, match=r"none of the images .* is there, first '0000\.exr'"):
+        read_scan(splats.folder, OPTIONS)

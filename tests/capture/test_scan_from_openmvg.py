@@ -114,6 +114,15 @@ def test_a_document_of_photographs_alone_says_what_to_do(tmp_path):
         read_scan(tmp_path, OPTIONS)
 
 
+def test_a_mesh_that_is_not_read_is_named(tmp_path):
+    room = truth().square()
+    _write(tmp_path, room, _document(room))
+    mesh = tmp_path / "scene_dense_mesh_refine_texture.obj"
+    mesh.rename(tmp_path / "mesh.fbx")
+    with pytest.raises(InputRefused, match=r"no mesh that is read \(mesh\.fbx is none of \.ply"):
+        read_scan(tmp_path, OPTIONS)
+
+
 def test_a_distortion_of_too_few_numbers_is_refused(tmp_path):
     _write(tmp_path, truth(), _document(truth(), disto_t2=[0.1, 0]))
     with pytest.raises(InputRefused, match="disto_t2 of a camera is not 5"):

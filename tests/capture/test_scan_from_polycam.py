@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image
 from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.develop import developed_in
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.frames import read_frame
 from usdbrdf.options import IngestOptions
 
 OPTIONS = IngestOptions(assume_srgb=True)
@@ -102,3 +104,27 @@ def test_cameras_without_pictures_are_answered_by_the_export(tmp_path):
     shutil.rmtree(tmp_path / "keyframes/images")
     with pytest.raises(InputRefused, match="Export 'Raw Data' from Polycam"):
         read_scan(tmp_path, OPTIONS)
+
+
+@pytest.mark.parametrize("corrected", [True, False])
+def test_the_black_rim_of_corrected_pictures_is_left_out(tmp_path, corrected):
+    """And of no others; a dark place within is no rim."""
+    room = truth()
+    _write(tmp_path, room, corrected=corrected)
+    folder = tmp_path / "keyframes" / ("corrected_images" if corrected else "images")
+    width = 4  # even, as JPEG halves colours
+    for i, image in enumerate(room.images):
+        framed = np.zeros_like(image)
+        framed[width:-width, width:] = np.maximum(image, 0.02)[width:-width, width:]
+        framed[:, width] /= 2
+        framed[11:13, 15:18] = 0
+        write_image(folder / f"{1000 + i}.jpg", framed)
+    scan = read_scan(tmp_path, OPTIONS)
+    (tmp_path / "frames").mkdir()
+    frames = developed_in(scan.frames, scan.views, tmp_path)
+    for i in range(len(frames)):
+        unknown = np.isnan(read_frame(frames, i).radiance).any(axis=2)
+        assert unknown[:, : width + 1].all() == corrected
+        assert unknown[: width + 1].all() == corrected
+        assert not unknown[width + 5 : -width - 5, width + 5 :].any()
+        assert corrected or not unknown.any()

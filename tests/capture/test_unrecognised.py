@@ -12,8 +12,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
 
 DOCUMENTS = [
-    ("castle.nvm", "NVM_V3\n\n11\n", "VisualSFM", "COLMAP"),
-    ("bundle.rd.out", "# Bundle file v0.3\n2 9\n", "Bundler", "COLMAP"),
+    ("castle.nvm", "NVM_V4\n\n11\n", "VisualSFM", "COLMAP"),
     ("castle.baf", "1\n11\n", "Meshroom", "cameras.sfm"),
     ("castle.mg", '{"header": {}}', "Meshroom", "cameras.sfm"),
     ("sfm_data.bin", "\x00", "OpenMVG", "ConvertSfM_DataFormat"),
@@ -38,14 +37,9 @@ DOCUMENTS = [
     ("room.psx", '<document version="1.2.0"/>', "Metashape", "Export Cameras"),
     ("room.rcproj", "<RealityCaptureProject/>", "RealityScan", "camera parameters"),
     ("scene.mvs", "MVS", "OpenMVS", "COLMAP"),
-    (
-        "at.xml",
-        '<?xml version="1.0"?>\n<BlocksExchange version="2.1">',
-        "ContextCapture",
-        "Agisoft",
-    ),
+    ("at.xmz", "PK\x03\x04", "ContextCapture", "Unzip it"),
     ("opk.txt", "# Label X Y Z Omega Phi Kappa\n", "Metashape", "Export Cameras"),
-    ("a_calibrated_camera_parameters.txt", "fileName imageWidth", "Pix4D", "COLMAP"),
+    ("a_calibrated_external_camera_parameters.txt", "imageName X", "Pix4D", "1_initial/params/"),
     ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n", "Stray Scanner", "fuse the"),
     ("pano-poses.csv", "# pano poses v1.0: ID; filename", "NavVis", "EQUIRECTANGULAR"),
     ("00000000_cam.txt", "extrinsic\n1 0 0 0\n", "MVSNet", "a transforms.json"),
@@ -61,7 +55,6 @@ DOCUMENTS = [
     ("shot.ma", "//Maya ASCII 2024 scene\n", "Maya", "as USD"),
     ("shot.c4d", "QC4D", "Cinema 4D", "as USD"),
     ("shot.chan", "1 0 0 0 0 0 0 50\n", "Nuke", "as USD"),
-    ("bundle.out", "2 9\n1 0 0\n", "Bundler", "COLMAP"),
     ("database.db", "SQLite format 3\x00", "COLMAP", "colmap mapper"),
 ]
 

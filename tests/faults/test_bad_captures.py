@@ -136,7 +136,7 @@ REFUSED: dict[str, tuple[Recipe, str, list[str]]] = {
     "missing mesh": (
         lambda c: (c.folder / "mesh.ply").unlink(),
         "mesh.missing",
-        ["mesh.ply", "does not exist", "--mesh"],
+        ["mesh.ply", "no mesh", "--mesh"],
     ),
     "empty mesh": (
         _mesh(lambda p, t, o: (p, t[:0], o[:0])),

@@ -314,6 +314,14 @@ READERS = {
         _of_capture("scannet", photographs=True),
         _of_capture("metashape", photographs=True),
         _of_capture("realityscan", photographs=True),
+        *(
+            _of_capture(
+                name,
+                photographs=True,
+                lines=(f"usdbrdf.capture.reconstructions.{name.replace('-', '_')}",),
+            )
+            for name in ("blocks-exchange", "bundler", "pix4d", "visualsfm")
+        ),
         _of_capture("e57", photographs=True),
         _of_capture(
             "usd",

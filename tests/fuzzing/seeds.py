@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -19,17 +21,21 @@ from PIL import Image
 from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from tests.capture import (
+    test_scan_from_blocks_exchange,
+    test_scan_from_bundler,
     test_scan_from_e57,
     test_scan_from_eyeful_tower,
     test_scan_from_fipt,
     test_scan_from_llff,
     test_scan_from_metashape,
+    test_scan_from_pix4d,
     test_scan_from_realityscan,
     test_scan_from_replica,
     test_scan_from_scanner_app,
     test_scan_from_scannet,
     test_scan_from_scannetpp,
     test_scan_from_usd_stage,
+    test_scan_from_visualsfm,
 )
 from tests.capture.test_raw_frames import write_dng
 from tests.format_truth import Truth, truth, write_image
@@ -430,6 +436,34 @@ def realityscan(folder: Path) -> list[Seed]:
     table = test_scan_from_realityscan.write_table(pictures, room)
     beside = test_scan_from_realityscan.write_sidecars(folder / "xmp", room, as_attributes=True)
     return [*_capture(table, "registration.csv"), *_capture(beside, "images/*.xmp")]
+
+
+def _document(folder: Path, module: ModuleType, name: str, **more: Any) -> list[Seed]:
+    """Of a program that reconstructs photographs, by the writer of its test."""
+    room = _room().centred()
+    module._write(folder, room, module._document(room, **more))
+    return _capture(folder, name)
+
+
+def blocks_exchange(folder: Path) -> list[Seed]:
+    lens = "<Distortion><K1>-0.01</K1><P1>0.001</P1></Distortion>"
+    seeds = _document(folder, test_scan_from_blocks_exchange, "block.xml", extra=lens)
+    text = "<SRS/><SRSOrigin>0,0,0</SRSOrigin>"
+    (folder / "metadata.xml").write_text(f"<ModelMetadata version='1'>{text}</ModelMetadata>")
+    return [*seeds, *_capture(folder, "metadata.xml")]
+
+
+def bundler(folder: Path) -> list[Seed]:
+    seeds = _document(folder, test_scan_from_bundler, "bundle.out", k1=-0.01)
+    return [*seeds, *_capture(folder, "list.txt")]
+
+
+def pix4d(folder: Path) -> list[Seed]:
+    return _document(folder, test_scan_from_pix4d, test_scan_from_pix4d.PARAMETERS)
+
+
+def visualsfm(folder: Path) -> list[Seed]:
+    return _document(folder, test_scan_from_visualsfm, "room.nvm", k=-0.01)
 
 
 def e57(folder: Path) -> list[Seed]:

@@ -567,6 +567,31 @@ def test_a_few_broken_faces_are_left_out(tmp_path, broken):
     assert len(mesh.triangles) == len(mesh.face_label) == expected.sum()
 
 
+_SPLATS = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty %s\nend_header\n1234"
+
+
+def test_files_of_other_kinds_say_what_to_do(tmp_path):
+    (tmp_path / "splats.ply").write_bytes(_SPLATS % b"float f_dc_0")
+    with pytest.raises(InputRefused, match=r"Gaussian splats, which have no surface\. Have a mesh"):
+        mesh_from_file(tmp_path / "splats.ply")
+    with pytest.raises(InputRefused, match=r"Save it as GLB\."):
+        mesh_from_file(tmp_path / "room.gltf")
+
+
+def test_a_large_compressed_glb_says_that_it_is_compressed(tmp_path):
+    """All of whose elements are announced, and none has bytes."""
+    accessors = [
+        {"componentType": 5126, "count": 2_000_000, "type": "VEC3"},
+        {"componentType": 5125, "count": 12_000_000, "type": "SCALAR"},
+    ]
+    _quad_glb(tmp_path / "mesh.glb", primitive=_DRACO, accessors=accessors)
+    with pytest.raises(InputRefused, match=r"its meshes are compressed \(Draco\)"):
+        mesh_from_file(tmp_path / "mesh.glb")
+    _quad_glb(tmp_path / "mesh.glb", accessors=accessors)
+    with pytest.raises(InputRefused, match=r"14000000 elements without bytes"):
+        mesh_from_file(tmp_path / "mesh.glb")
+
+
 @pytest.mark.fault("G1")
 @pytest.mark.fault("G8")
 @pytest.mark.parametrize(
@@ -581,6 +606,9 @@ def test_a_few_broken_faces_are_left_out(tmp_path, broken):
         ("far.obj", b"v 0 0 0\nv 1e9 0 0\nv 0 1 0\nf 1 2 3\n", "mesh.far"),
         ("tiny.obj", b"v 0 0 0\nv 1e-9 0 0\nv 0 1e-9 0\nf 1 2 3\n", "mesh.tiny"),
         ("mesh.stl", b"solid", "mesh.format"),
+        ("mesh.gltf", b"{}", "mesh.format"),
+        ("splats.ply", _SPLATS % b"float f_dc_0", "mesh.empty"),
+        ("packed.ply", _SPLATS % b"uint packed_position", "mesh.empty"),
     ],
 )
 def test_unusable_files_are_refused_in_one_sentence(tmp_path, name, content, rule):

@@ -43,6 +43,8 @@ class FrameRecord:
                        that bends becomes one pinhole frame or several
     mask_path          absolute: a picture of the photograph's size or shape, whose black pixels are
                        not used; or None
+    rim                what is black along its border is no part of the photograph, as where its
+                       lens has been undone
     captured_pose      world_from_camera before somebody refined it; None where it is as captured
     size_of_image      resolution is the image's own, for lack of a statement
     """
@@ -57,6 +59,7 @@ class FrameRecord:
     noise_floor_radiance: float = 0.0
     lens: Lens = PINHOLE
     mask_path: Path | None = None
+    rim: bool = False
     captured_pose: Double | None = None
     size_of_image: bool = False
 

@@ -18,6 +18,7 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 
 from usdbrdf.capture.checks import FrameRecord
 from usdbrdf.capture.lens_views import Intrinsics, PinholeView, Size, shows_any, views_of
@@ -47,6 +48,7 @@ _TOUCHES = 1e-4
 # Rows of a frame whose places in the photograph are computed at a time, and frames whose places
 # are kept: the faces of one sphere.
 _ROWS, _KEPT_MAPS = 64, 6
+_BESIDE_RIM = 4  # pixels beside a black rim that it reaches: half a block of JPEG
 
 
 def frames_of_photographs(
@@ -55,10 +57,10 @@ def frames_of_photographs(
     """The pinhole frames of N photographs, the views that they are (see ``Scan``), and for each its
     photograph's number.
 
-    Photographs without lens and mask are frames as they are, but for 8-bit ones beside others: a
-    capture has one encoding.
+    Photographs without lens, mask and rim are frames as they are, but for 8-bit ones beside others:
+    a capture has one encoding.
     """
-    plain = [not record.lens.bends and record.mask_path is None for record in records]
+    plain = [not (r.lens.bends or r.mask_path or r.rim) for r in records]
     if all(plain):
         return photographs, (), np.arange(len(records))
     if kind_of_encoding(photographs.encoding) != "linear":
@@ -85,6 +87,7 @@ def frames_of_photographs(
                 intrinsics=record.intrinsics,
                 photograph_from_frame=found.photograph_from_frame,
                 face=found.face,
+                rim=record.rim,
             )
             views.append(None if plain[k] else view)
     which = np.array(numbers)
@@ -165,7 +168,8 @@ def developed_in(frames: Frames, views: Sequence[View | None], folder: Path) -> 
 
 def _write_frame(frames: Frames, i: int, view: View, path: Path) -> None:
     saturation = float(frames.saturation_radiance[i])
-    source = _recorded(view.photograph, view.mask, frames.encoding, saturation)
+    black = float(frames.noise_floor_radiance[i]) if view.rim else None
+    source = _recorded(view.photograph, view.mask, frames.encoding, saturation, black)
     image = resampled(source, view, frames.camera(i), saturation)
     write_exr(
         path,
@@ -177,12 +181,27 @@ def _write_frame(frames: Frames, i: int, view: View, path: Path) -> None:
 
 
 @lru_cache(maxsize=1)
-def _recorded(photograph: Path, mask: Path | None, encoding: str, saturation: float) -> Float:
-    """(H, W, 3) of a photograph, not to be written to; NaN where it or its mask tells nothing."""
+def _recorded(
+    photograph: Path, mask: Path | None, encoding: str, saturation: float, black: float | None
+) -> Float:
+    """(H, W, 3) of a photograph, not to be written to; NaN where it or its mask tells nothing, and
+    in its rim, of what is no brighter than ``black``."""
     recorded = read_recorded(photograph, encoding, saturation).radiance
     if mask is not None:
         recorded[~mask_at_size(mask, *recorded.shape[:2])] = np.nan
+    if black is not None:
+        recorded[_rim_of(recorded, black)] = np.nan
     return recorded
+
+
+def _rim_of(recorded: Float, black: float) -> Bool:
+    """(H, W): what is black and hangs together with the border, and the pixels beside it: they mix
+    it with the picture, and JPEG lets it shine through."""
+    border = np.ones(recorded.shape[:2], np.bool_)
+    border[1:-1, 1:-1] = False
+    dark = ~(recorded.max(axis=2) > black)
+    rim = ndimage.binary_propagation(border & dark, mask=dark)
+    return np.asarray(ndimage.binary_dilation(rim, np.ones((3, 3)), _BESIDE_RIM), np.bool_)
 
 
 @lru_cache(maxsize=1)

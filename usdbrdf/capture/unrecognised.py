@@ -65,9 +65,7 @@ _PROGRAMS = (
         "Open3D", (), (), rb"\A\d+\s+\d+\s+\d+[ \t\r]*\n(?:[ \t]*(?:[-+.\de]+\s+){4}){4}",
         f"Write them as trajectory.json, with the lens, and read them with {_EXAMPLE}",
     ),
-    _Program("VisualSFM", (".nvm",), (), rb"NVM_V3", _ANEW),
-    # What says nothing but .out, its suffix, may be a text of any kind.
-    _Program("Bundler", ("bundle.out",), (), rb"# Bundle file", _ANEW),
+    _Program("VisualSFM", (".nvm",), (), rb"NVM_V", _ANEW),
     _Program(
         "Polycam", (), (), rb'"t_00"',
         "Name the whole folder of its raw data, which holds keyframes/, raw.glb and mesh_info.json",
@@ -123,18 +121,16 @@ _PROGRAMS = (
     ),
     _Program("OpenMVS", (".mvs",), (), _NOTHING, _ANEW),
     _Program(
-        "ContextCapture", (), (), rb"<BlocksExchange",
-        "From Metashape export them as Agisoft XML, of other programs reconstruct the same "
-        "photographs with COLMAP",
+        "ContextCapture", (".xmz",), (), _NOTHING,
+        "Unzip it: it holds a BlocksExchange XML, which is read",
     ),
     _Program(
         "Metashape", (), (), rb"(?mi)^#.*\bomega\b.*\bphi\b.*\bkappa\b",
         "Export them as Agisoft XML (File > Export > Export Cameras), which has the lens too",
     ),
     _Program(
-        "Pix4D",
-        (".p4d", "camera_parameters.txt", "pmatrix.txt"),
-        (), _NOTHING, _ANEW,
+        "Pix4D", (".p4d", "camera_parameters.txt", "camera_parameters.cam", "pmatrix.txt"), (),
+        _NOTHING, "Bring the project's 1_initial/params/*_calibrated_camera_parameters.txt",
     ),
     _Program(
         "Stray Scanner", (), (), rb"\Atimestamp, *frame, *x, *y, *z, *qx",

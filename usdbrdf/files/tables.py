@@ -50,11 +50,16 @@ def beginning_of_text(path: Path) -> str:
     return head.decode(encoding_of_text(head), "replace")
 
 
-def number_rows(path: Path) -> tuple[Double, ...]:
+def number_rows(path: Path, *, most: int | None = None) -> tuple[Double, ...]:
     """Each line's numbers, (n,) float64, separated by blanks or commas; lines without any, and
-    what follows a #, are passed over. NaN and infinities are for the caller to judge."""
-    rows = []
+    what follows a #, are passed over. NaN and infinities are for the caller to judge.
+
+    most  of so many lines, the first that have any
+    """
+    rows: list[Double] = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
+        if len(rows) == most:
+            break
         numbers = line.partition("#")[0].replace(",", " ")
         if not numbers.strip():
             continue

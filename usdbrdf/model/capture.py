@@ -151,6 +151,7 @@ class View:
     lens, intrinsics        of the photograph
     photograph_from_frame   (3, 3) rotation of directions between the cameras' axes
     face                    which part of the photograph it shows, "" for all of it
+    rim                     what is black along the photograph's border is no part of it
     """
 
     photograph: Path
@@ -159,6 +160,7 @@ class View:
     intrinsics: tuple[float, float, float, float]
     photograph_from_frame: Double
     face: str = ""
+    rim: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,9 +12,11 @@ import numpy as np
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Double
 
-Curve = Literal["perspective", "fisheye", "fov", "division", "eucm", "equirectangular"]
+Curve = Literal[
+    "perspective", "fisheye", "fov", "division", "undistorting", "eucm", "equirectangular"
+]
 # Parameters of each curve, by the names of those who proposed it.
-_SHAPE = {"fov": ("omega",), "division": ("k",), "eucm": ("alpha", "beta")}
+_SHAPE = {"fov": ("omega",), "division": ("k",), "undistorting": ("k",), "eucm": ("alpha", "beta")}
 _MOST_RADIAL = 8
 # Angles between 0 and a half turn at which a curve is looked at for where it turns back.
 _ANGLES = 20_001
@@ -37,11 +39,12 @@ class Lens:
     curve       perspective: r = tan t; fisheye (equidistant): r = t;
                 fov (Devernay and Faugeras 2001): r = atan(2 tan t tan(omega/2)) / omega;
                 division (Fitzgibbon 2001): r / (1 + k r^2) = tan t;
+                undistorting (VisualSFM): r (1 + k r^2) = tan t;
                 eucm (Khomutenko et al. 2016): r = sin t / (alpha e + (1 - alpha) cos t) with
                 e^2 = beta sin^2 t + cos^2 t;
                 equirectangular: x is the longitude, y minus the latitude, in radians: fx is the
                 width / 2 pi, fy the height / pi (see ``whole_sphere``)
-    shape       what the curve has beside t: (omega,), (k,), (alpha, beta)
+    shape       what the curve has beside t: (omega,), (k,), (k,), (alpha, beta)
     radial      k1, k2, ... as many as there are
     divisor     d1, d2, ...; OpenCV calls its three k4, k5, k6
     tangential  p1, p2 in OpenCV's order (Metashape's and Aria's are the other way round)
@@ -90,7 +93,7 @@ class Lens:
     def bends(self) -> bool:
         """False for a pinhole."""
         numbers = (*self.radial, *self.divisor, *self.tangential, *self.prism, self.skew)
-        plain = self.curve == "division" and not any(self.shape)
+        plain = self.curve in ("division", "undistorting") and not any(self.shape)
         return bool(any(numbers) or not (self.curve == "perspective" or plain))
 
     def project(self, directions: Double, intrinsics: tuple[float, float, float, float]) -> Double:
@@ -157,6 +160,13 @@ class Lens:
             # The root of k tan(t) r^2 - r + tan(t) = 0 that is tan(t) for k = 0.
             root = np.sqrt(1 - 4 * k * tangent**2)
             return np.asarray(2 * tangent / (1 + root))
+        if self.curve == "undistorting" and any(self.shape):
+            (k,) = self.shape
+            # The root of k r^3 + r - tan(t) = 0 that is tan(t) for k = 0; none where it turns back.
+            size = 2 / np.sqrt(3 * abs(k))
+            third = 3 * tangent / size
+            root = np.sinh(np.arcsinh(third) / 3) if k > 0 else np.sin(np.arcsin(third) / 3)
+            return np.asarray(size * root)
         return tangent
 
     def _stretch(self, squared: Double) -> Double:

@@ -129,13 +129,14 @@ def triangulate(
 
     counts   (P,) corners per polygon
     indices  (C,) point of each corner
+    holes    numbers of polygons; those of none are ignored, as USD's renderers do
     points   (V, 3): where they are given, polygons whose fan would leave them are cut otherwise, in
              as many triangles; indices are inside [0, V) then
     """
     counts = np.asarray(counts, np.int64)
     fans = np.maximum(counts - 2, 0)
-    if holes is not None and len(holes):
-        fans[np.asarray(holes)] = 0
+    if holes is not None:
+        fans[holes[(holes >= 0) & (holes < len(counts))]] = 0
     polygon = np.repeat(np.arange(len(counts)), fans)
     in_fan = np.arange(len(polygon)) - np.repeat(np.cumsum(fans) - fans, fans)
     firsts = np.cumsum(counts) - counts

@@ -4,8 +4,6 @@ and what is put into a scene with its materials."""
 from __future__ import annotations
 
 import errno
-import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -34,23 +32,24 @@ from usdbrdf.model.material import (
 )
 from usdbrdf.untrusted.bounds import read_in_child, refuse_far, refuse_large
 from usdbrdf.untrusted.mesh_gltf import (
+    document_of,
     emissive_strength,
     geometry_not_read,
     is_clear,
     normal_reflectance_of,
     refuse_false,
+    refuse_promises,
     taken_colours,
     unread,
     with_numbered_materials,
 )
-from usdbrdf.untrusted.mesh_ply import ply_of
+from usdbrdf.untrusted.mesh_ply import holds_splats, ply_of
 from usdbrdf.untrusted.mesh_text import missing_vertex, obj_of_convex_faces, parts_of_obj, plain_obj
 
 SUFFIXES = (".ply", ".obj", ".glb")
 # The face property by which the objects of a segmented PLY are told apart.
 LABEL_PROPERTY = "object_id"
 _MAX_TRIANGLES = 50_000_000
-_MAX_ZEROS = 8 << 20  # elements of a GLB that have no bytes
 _MAX_COORDINATE = 1e6
 _MIN_DIAGONAL = 1e-4
 # Faces with broken corners below this share are removed; above it the file is not what it says.
@@ -84,9 +83,9 @@ def mesh_from_file(path: Path) -> FileMesh:
     Faces of more corners become triangles, in place, and hand their label to all of them.
     """
     if path.suffix.lower() not in SUFFIXES:
+        cure = "Save it as GLB" if path.suffix.lower() == ".gltf" else "Convert it to PLY"
         raise InputRefused(
-            f"{path}: meshes are read from {', '.join(SUFFIXES)} and USD. Convert it to PLY. "
-            "[mesh.format]"
+            f"{path}: meshes are read from {', '.join(SUFFIXES)} and USD. {cure}. [mesh.format]"
         )
     return read_in_child("mesh", f"{__name__}:read_mesh_here", path, FileMesh)
 
@@ -189,7 +188,13 @@ def _refuse_if_many(path: Path, broken: Bool, what: str, rule: str) -> None:
 
 
 def _mesh_from_ply(file: BinaryIO) -> FileMesh:
-    ply = ply_of(file.read())
+    content = file.read()
+    if holds_splats(content):
+        raise InputRefused(
+            f"{file.name}: Gaussian splats, which have no surface. Have a mesh made of what they "
+            "were trained on, and name it with --mesh. [mesh.empty]"
+        )
+    ply = ply_of(content)
     cut, label = ply.triangulation, ply.faces.get(LABEL_PROPERTY)
     if label is not None and label.dtype.kind == "f":
         with np.errstate(invalid="ignore", over="ignore"):
@@ -228,31 +233,14 @@ def _fans(faces: Any) -> Any:
     return polygons[:, fan].reshape(-1, 3)
 
 
-def _refuse_promises(file: BinaryIO) -> dict[str, Any]:
-    """The document of a GLB. ValueError where it announces more than it holds, for which room would
-    be made before anybody looks: longer parts, or elements without bytes, which are zeros."""
-    size = file.seek(0, os.SEEK_END)
-    starts = [12]
-    while starts[-1] + 8 <= size:
-        file.seek(starts[-1])
-        starts.append(starts[-1] + 8 + int.from_bytes(file.read(4), "little"))
-    if starts[-1] > size:
-        raise ValueError(f"a part ends {starts[-1] - size} bytes after the file")
-    file.seek(20)
-    document: dict[str, Any] = json.loads(file.read(starts[1] - 20)) if len(starts) > 1 else {}
-    file.seek(0)
-    promised = [int(a["count"]) for a in document.get("accessors", ()) if "bufferView" not in a]
-    if sum(map(abs, promised)) > _MAX_ZEROS:
-        raise ValueError(f"{sum(promised)} elements without bytes (limit {_MAX_ZEROS})")
-    return document
-
-
 def _mesh_from_glb(file: BinaryIO) -> FileMesh:
-    if said := geometry_not_read(_refuse_promises(file)):
+    document = document_of(file)
+    if said := geometry_not_read(document):
         raise InputRefused(
             f"{file.name}: {said}, which is not read here. Export it again as plain triangles, "
             "posed and without compression, or convert it to PLY. [mesh.format]"
         )
+    refuse_promises(document)
     scene = trimesh.load_scene(file, file_type="glb", process=False)
     parts = []
     for node in sorted(scene.graph.nodes_geometry):

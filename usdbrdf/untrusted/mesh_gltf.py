@@ -4,6 +4,7 @@ what geometry it passes over or takes for another."""
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Sequence
 from io import BytesIO
@@ -17,6 +18,7 @@ from usdbrdf.model.arrays import Float
 from usdbrdf.model.material import normal_reflectance
 
 _HEAD = 12  # bytes before the first part; each part begins with 8 more
+_MAX_ZEROS = 8 << 20  # elements that have no bytes
 _IOR = 1.5
 _MOST = float(np.finfo(np.float32).max)
 # What is read of extensions, and what it is where a material does not say it.
@@ -30,6 +32,30 @@ _EXTENSIONS: dict[tuple[str, str], float | tuple[float, ...]] = {
 _DRACO, _INSTANCES = "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"
 _MESHOPT = frozenset(("EXT_meshopt_compression", "KHR_meshopt_compression"))
 _FLOAT, _FAN = 5126, 6
+
+
+def document_of(file: BinaryIO) -> dict[str, Any]:
+    """The document of a GLB. ValueError where it announces longer parts than it holds, for which
+    room would be made before anybody looks."""
+    size = file.seek(0, os.SEEK_END)
+    starts = [_HEAD]
+    while starts[-1] + 8 <= size:
+        file.seek(starts[-1])
+        starts.append(starts[-1] + 8 + int.from_bytes(file.read(4), "little"))
+    if starts[-1] > size:
+        raise ValueError(f"a part ends {starts[-1] - size} bytes after the file")
+    file.seek(_HEAD + 8)
+    text = file.read(starts[1] - _HEAD - 8) if len(starts) > 1 else b"{}"
+    document: dict[str, Any] = json.loads(text)
+    file.seek(0)
+    return document
+
+
+def refuse_promises(document: dict[str, Any]) -> None:
+    """ValueError where many elements have no bytes: they would be zeros."""
+    promised = [int(a["count"]) for a in document.get("accessors", ()) if "bufferView" not in a]
+    if sum(map(abs, promised)) > _MAX_ZEROS:
+        raise ValueError(f"{sum(promised)} elements without bytes (limit {_MAX_ZEROS})")
 
 
 def geometry_not_read(document: dict[str, Any]) -> str:

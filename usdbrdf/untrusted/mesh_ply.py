@@ -94,6 +94,12 @@ def _property(named: tuple[str, Array]) -> str:
     return f"property {_NAMES[array.dtype.str[1:]]} {name}"
 
 
+def holds_splats(content: bytes) -> bool:
+    """Whether its vertices are Gaussians, as they are trained, or as they are packed."""
+    head = content[: content.find(b"end_header", 0, _LONGEST_HEADER)]
+    return re.search(rb"property[ \t]+\w+[ \t]+(f_dc_0|packed_position)\b", head) is not None
+
+
 def ply_of(content: bytes) -> Ply:
     """What the bytes of a PLY say. ValueError for what is none, says less than it announces, or
     more: its numbers are not those that its header is for then."""

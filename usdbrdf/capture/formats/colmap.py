@@ -4,9 +4,11 @@
 
     CAPTURE/
       sparse/0/ or sparse/ or the folder itself     cameras and images, distorted or not
-      images/                                       as the model names them, in subfolders too
+      images/, input/, images_2/ ...                as the model names them, in subfolders too;
+                                                    else the only other folder that holds them
       dense/ or dense/0/ ...: sparse/, images/      what image_undistorter writes: used where the
                                                     distorted images are not there
+      distorted/sparse/0, input/                    what those had before them, who train splats
       mesh.ply, meshed-poisson.ply, ...             in one of these folders, or by --mesh
 
 A model's poses are camera from world, with a camera whose x points right, y down and z forward;
@@ -40,9 +42,11 @@ NAME = "colmap"
 DESCRIPTION = DESCRIPTIONS[NAME]
 # Workspaces below the capture, as COLMAP and those who follow it lay them out; where the model lies
 # in a workspace; and where its images do.
-_WORKSPACES = ("", "dense", "dense/0", "undistorted", "colmap")
+_WORKSPACES = ("", "dense", "dense/0", "undistorted", "colmap", "distorted")
 _MODELS = ("", "sparse/0", "sparse")
-_IMAGES = ("images", "input", "")
+_IMAGES = ("images", "input", "", "images_2", "images_4", "images_8")
+# How deep in the capture other folders of images are looked for.
+_BELOW = ("*/", "*/*/")
 # The last two are what COLMAP's own meshers write; fused.ply is a point cloud.
 _MESHES = (
     "mesh.ply", "mesh.obj", "mesh.glb", "mesh.usd", "mesh.usda", "mesh.usdc",
@@ -153,7 +157,11 @@ def _workspaces(path: Path) -> list[_Workspace]:
         base = f"{workspace}/" if workspace else ""
         beside = [f"{base}{images}".rstrip("/") for images in _IMAGES]
         if workspace == "colmap":  # as nerfstudio has it
-            beside += ["images"]
+            beside += ["images", *(name for name in _IMAGES if name.startswith("images_"))]
+        if workspace == "distorted":
+            beside += ["input"]
+        elif not workspace and (path / "distorted/sparse").is_dir():
+            beside.remove("input")  # what its images were made of
         found += [_Workspace(f, tuple(beside)) for f in folders if model_files(f)]
     return found
 
@@ -163,7 +171,7 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
     workspaces = _workspaces(path)
     pictured = Pictured(folder=path, options=options)
     candidates: list[_Chosen] = []
-    named = 0
+    named, first = 0, ""
     for workspace in workspaces:
         model = colmap_model(workspace.model)
         if not model.names:
@@ -175,8 +183,11 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
         if max(counts):
             images = workspace.images[counts.index(max(counts))]
             candidates.append(_Chosen(model, workspace.model, images))
+        first = first or model.names[0]
+    if not candidates and options.frames is None:
+        candidates = _elsewhere(path, workspaces, findings)
     if not candidates:
-        where = f"{path}: none of the images that the COLMAP model names is there"
+        where = f"{path}: none of the images that the COLMAP model names is there, first {first!r}"
         if not workspaces:
             where = f"{path}: no COLMAP model (cameras and images, .bin or .txt)"
         elif not named:
@@ -200,6 +211,29 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
             f"{len(largest.model.names)}. [colmap.model]"
         )
     return largest
+
+
+def _elsewhere(path: Path, workspaces: Sequence[_Workspace], findings: Findings) -> list[_Chosen]:
+    """The first model with images, by their very names, in one folder of the capture; InputRefused
+    where several hold them."""
+    folders = [p for below in _BELOW for p in sorted(path.glob(below)) if not p.is_symlink()]
+    for workspace in workspaces:
+        model = colmap_model(workspace.model)
+        counts = {p: sum((p / name).is_file() for name in model.names) for p in folders}
+        most = max(counts.values(), default=0)
+        found = [p.relative_to(path).as_posix() for p, count in counts.items() if count == most]
+        if most and len(found) > 1:
+            raise InputRefused(
+                f"{path}: {', '.join(found[:3])} all hold the images that the COLMAP model names. "
+                "Name the folder of the photographs with --frames. [colmap.images]"
+            )
+        if most:
+            findings.warn(
+                f"{path.name}: the images of the COLMAP model are taken from {found[0]}/, the only "
+                "folder that holds them. [capture.file]"
+            )
+            return [_Chosen(model, workspace.model, found[0])]
+    return []
 
 
 def _images_fit(pictured: Pictured, one: _Chosen, others: Sequence[_Chosen]) -> bool:

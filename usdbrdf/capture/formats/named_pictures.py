@@ -46,12 +46,12 @@ _PHOTOGRAPHS, _RADIANCE = frozenset((".jpg", ".jpeg")) | _OF_CAMERAS, (".exr", "
 # Where programs put the pictures, beside what they say of them.
 FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
 # Of documents that name pictures where they lay on another machine.
-_OTHER_FOLDER = (
-    "Name the folder of the pictures with --frames, or put them inside this one and name them "
-    "relative to it"
-)
+_OTHER_FOLDER = "Name the folder of the pictures with --frames, or name them relative to this one"
 _MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
+# What programs call their points, which are no mesh although PLY may hold one.
+_CLOUDS = ("sparse_pc.ply", "point_cloud.ply", "points3d.ply", "fused.ply", "sparse.ply")
+_UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
 
 
 def path_in_capture(root: Path, candidate: str, options: CaptureOptions, *, cure: str = "") -> Path:
@@ -374,10 +374,16 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
         found = [p for p in sorted(folder.glob(pattern)) if p.suffix.lower() in _MESHES]
         if found:
             return contained(folder, found[0].relative_to(folder).as_posix())
-    others = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in _MESHES]
+    there = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in _MESHES]
+    others = [p for p in there if p.name.lower() not in _CLOUDS]
     if len(others) == 1:
         return contained(folder, others[0].name)
+    unread = [p.name for p in sorted(folder.iterdir()) if p.suffix.lower() in _UNREAD_MESHES]
     said = f"{len(others)} meshes" if others else "no mesh"
+    if unread and not others:
+        said += f" that is read ({unread[0]} is none of {', '.join(_MESHES)})"
+    elif there and not others:
+        said += f" ({there[0].name} holds points alone)"
     raise InputRefused(f"{folder}: {said}. {how}, or name one with --mesh. [mesh.missing]")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -13,9 +14,17 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord, at_image_size, clause_of
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO
-from usdbrdf.capture.formats.named_pictures import Pictured, path_in_capture, scan_of
+from usdbrdf.capture.formats.named_pictures import Pictured, mesh_beside, path_in_capture, scan_of
+from usdbrdf.capture.formats.nerfstudio_frames import (
+    EXPORTED,
+    Applied,
+    geometry_at_home,
+    rigid_matrix,
+    stated_pose,
+    statements_beside,
+)
 from usdbrdf.capture.parts import geometry_from_file
-from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
+from usdbrdf.capture.rigid_poses import is_camera_matrix
 from usdbrdf.capture.unrecognised import other_program
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -25,6 +34,7 @@ from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Curve, Lens, whole_sphere
+from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions, UpAxis
 
 NAME = "transforms"
@@ -44,6 +54,7 @@ _LARGEST = 1e15
 # Where no size is stated: a principal point this far from the image's centre, or an image this much
 # wider than its angle says, in parts of its size, belongs to an image of another size.
 _OFF_CENTRE = 0.2
+beside_mesh = statements_beside
 
 
 def matches(path: Path) -> bool:
@@ -67,14 +78,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             )
     return scan_of(
         records,
-        lambda: geometry_from_file(
-            options.mesh or _beside(capture, "mesh", "mesh.ply"),
-            _objects(capture),
-            options,
-            findings,
-            capture_root=source.parent,
-            meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
-        ),
+        lambda: _geometry(capture, findings),
         options,
         findings,
         adapter=NAME,
@@ -84,6 +88,27 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         radiometric=_radiometric(capture),
         meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
         up_axis=up_axis,
+    )
+
+
+def _geometry(capture: _Capture, findings: Findings) -> ScanGeometry:
+    """Of the mesh that the document names, else mesh.ply beside it, else the only one there."""
+    options, root = capture.options, capture.source.parent
+    mesh = options.mesh or _beside(capture, "mesh", "mesh.ply")
+    if "mesh" not in capture.document and not mesh.is_file():
+        how = "Put mesh.ply beside the poses"
+        mesh = mesh_beside(root, options, "mesh.*", *EXPORTED, how=how)
+    unit = capture.positive({}, "meters_per_unit") or 1.0
+    return geometry_at_home(
+        mesh,
+        lambda own: geometry_from_file(
+            mesh, _objects(capture), own, findings, capture_root=root, meters_per_unit=unit
+        ),
+        options,
+        findings,
+        capture.applied,
+        capture.document,
+        meters_per_unit=unit,
     )
 
 
@@ -142,6 +167,17 @@ class _Capture:
 
     def refuse(self, text: str, rule: str) -> InputRefused:
         return InputRefused(f"{self.source}: {text} [{rule}]")
+
+    @cached_property
+    def applied(self) -> Applied:
+        """What has been done to the world that the mesh was made in."""
+        stated = self.document.get("applied_transform")
+        usual = OLD_NERFSTUDIO if self.is_legacy else np.eye(4)
+        matrix = usual if stated is None else rigid_matrix(stated)
+        if matrix is None:
+            said = "applied_transform is not a rigid 3 x 4 matrix. Correct or remove it."
+            raise self.refuse(said, "capture.pose")
+        return Applied(matrix=matrix, scale=self.positive({}, "applied_scale") or 1.0)
 
     def number(self, frame: Mapping[str, Any], key: str) -> float | None:
         """A number of the frame, else of the document, else None."""
@@ -243,7 +279,7 @@ def _record(
     if path is None:
         findings.drop(name, "the image file does not exist", "capture.file")
         return None
-    pose = _pose(frame.get("transform_matrix"))
+    pose = stated_pose(frame.get("transform_matrix"))
     if pose is None:
         findings.drop(
             name, "it has no transform_matrix of 4 x 4 finite and sensible numbers", "capture.pose"
@@ -264,7 +300,7 @@ def _record(
     return FrameRecord(
         name=name,
         image_path=path,
-        world_from_camera=_undo_applied_transform(capture, pose),
+        world_from_camera=capture.applied.undone(pose),
         captured_pose=_captured_pose(capture, frame, name),
         intrinsics=_intrinsics(capture, frame, name, lens, width, height),
         resolution=(width, height),
@@ -277,27 +313,17 @@ def _record(
     )
 
 
-def _pose(matrix: object) -> Double | None:
-    try:
-        pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError):
-        return None
-    if pose.shape == (3, 4):
-        pose = np.vstack([pose, [0.0, 0, 0, 1]])
-    return pose if pose.shape == (4, 4) and (np.abs(pose) <= LARGEST_OF_POSE).all() else None
-
-
 def _captured_pose(capture: _Capture, frame: Mapping[str, Any], name: str) -> Double | None:
     """The pose before it was refined, which says that it was."""
     stated = frame.get("captured_transform_matrix")
-    pose = _pose(stated)
+    pose = stated_pose(stated)
     if stated is not None and (pose is None or not is_camera_matrix(pose)):
         raise capture.refuse(
             f"the captured_transform_matrix of the frame {name!r} is not a matrix of 4 x 4 finite "
             "and sensible numbers. Correct or remove it.",
             "capture.pose",
         )
-    return None if pose is None else _undo_applied_transform(capture, pose)
+    return None if pose is None else capture.applied.undone(pose)
 
 
 def _intrinsics(
@@ -447,28 +473,6 @@ def _mask(capture: _Capture, frame: Mapping[str, Any], name: str) -> Path | None
             "capture.mask",
         )
     return path_in_capture(capture.source.parent, mask, capture.options)
-
-
-def _undo_applied_transform(capture: _Capture, pose: Double) -> Double:
-    """Back from nerfstudio's world to the one that the mesh was made in."""
-    scale = capture.positive({}, "applied_scale") or 1.0
-    undone = pose.copy()
-    undone[:3, 3] /= scale
-    applied = capture.document.get(
-        "applied_transform", OLD_NERFSTUDIO.tolist() if capture.is_legacy else None
-    )
-    if applied is None:
-        return undone
-    matrix = _pose(applied)
-    if (
-        matrix is None
-        or not is_camera_matrix(matrix)
-        or np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > 1e-3
-    ):
-        raise capture.refuse(
-            "applied_transform is not a rigid 3 x 4 matrix. Correct or remove it.", "capture.pose"
-        )
-    return np.asarray(np.linalg.inv(matrix) @ undone, np.float64)
 
 
 def _beside(capture: _Capture, key: str, usual: str) -> Path:

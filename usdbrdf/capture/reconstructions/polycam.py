@@ -68,6 +68,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         how="Export 'Raw Data' from Polycam with raw.glb, or the mesh as GLTF, into this folder",
         up_axis="Y",
         in_metres=True,
+        # What the corrected ones show of no picture, black by up to some ten pixels.
+        rim=whole[0] is _KEYFRAMES[0],
     )
 
 

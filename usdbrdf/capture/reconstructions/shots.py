@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     drop_without_picture,
@@ -21,6 +21,8 @@ from usdbrdf.capture.formats.named_pictures import (
     warn_of_unused,
 )
 from usdbrdf.capture.up_axis import up_axis_assumed
+from usdbrdf.errors import ImageRefused
+from usdbrdf.files.images import image_size
 from usdbrdf.files.tables import numbers_among
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -38,6 +40,22 @@ class ShotCamera:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CentredCamera:
+    """A camera whose document says no size of its photographs, as its focal length is in their
+    pixels and its principal point in their middle."""
+
+    focal: float
+    lens: Lens = PINHOLE
+
+    def of_size(self, width: int, height: int) -> ShotCamera:
+        return ShotCamera(
+            resolution=(width, height),
+            intrinsics=(self.focal, self.focal, width / 2, height / 2),
+            lens=self.lens,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Shot:
     """One photograph of a document.
 
@@ -48,7 +66,7 @@ class Shot:
     """
 
     name: str
-    camera: ShotCamera | None
+    camera: ShotCamera | CentredCamera | None
     world_from_camera: Double | None
     problem: str = ""
 
@@ -78,6 +96,7 @@ def scan_of_shots(
     how: str,
     up_axis: str | None = None,
     in_metres: bool = False,
+    rim: bool = False,
 ) -> Scan:
     """The capture of a document's photographs with the mesh beside them.
 
@@ -86,6 +105,7 @@ def scan_of_shots(
                     them
     meshes, how     patterns of the program's own names, and what to do where there is no mesh
     up_axis         None where the format does not say
+    rim             what is black along the pictures' borders is no part of them
     in_metres       False where the unit is that of the reconstruction, which nobody knows
     """
     if not in_metres and options.meters_per_unit is None:
@@ -105,15 +125,24 @@ def scan_of_shots(
         if image is None:
             drop_without_picture(shot.name, findings)
             continue
+        camera = shot.camera
+        if isinstance(camera, CentredCamera):
+            try:
+                camera = camera.of_size(*image_size(image)[:2])
+            except ImageRefused as error:
+                findings.drop(shot.name, clause_of(error, image), "capture.image")
+                continue
         records.append(
             FrameRecord(
                 name=shot.name,
                 image_path=image,
                 world_from_camera=opengl_from_opencv(shot.world_from_camera),
-                intrinsics=shot.camera.intrinsics,
-                resolution=shot.camera.resolution,
-                lens=shot.camera.lens if shot.camera.lens.bends else PINHOLE,
+                intrinsics=camera.intrinsics,
+                resolution=camera.resolution,
+                size_of_image=camera is not shot.camera,
+                lens=camera.lens if camera.lens.bends else PINHOLE,
                 mask_path=pictures.mask_of(image, folder, options),
+                rim=rim,
             )
         )
     records.sort(key=lambda record: record.image_path)

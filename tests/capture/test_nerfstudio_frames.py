@@ -1,0 +1,187 @@
+"""Meshes that nerfstudio exports beside its transforms.json, turned, moved and scaled as its
+dataparser does (nerfstudio_dataparser.py, auto_orient_and_center_poses)."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.scenes import edited, make_capture, write_ply
+from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
+from usdbrdf.errors import InputRefused
+from usdbrdf.options import IngestOptions
+
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])
+OLD = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+
+
+@pytest.fixture
+def capture(tmp_path):
+    return make_capture(tmp_path / "room")
+
+
+def _train(made, *, applied=None, applied_scale=None, legacy=False, folder=None, name):
+    """The document as ns-process-data leaves it, and the mesh of a training on it."""
+    matrix, larger = (OLD if legacy else np.eye(4) if applied is None else applied), 1.0
+    with edited(made.manifest) as document:
+        if applied is not None:
+            document["applied_transform"] = applied[:3].tolist()
+        if applied_scale is not None:
+            document["applied_scale"] = larger = applied_scale
+        for frame in document["frames"]:
+            pose = matrix @ np.array(frame["transform_matrix"])
+            pose[:3, 3] *= larger
+            frame["transform_matrix"] = pose.tolist()
+        poses = np.array([frame["transform_matrix"] for frame in document["frames"]])
+    stored = larger * (made.points @ matrix[:3, :3].T + matrix[:3, 3])
+    if legacy:
+        (made.folder / "colmap/sparse/0").mkdir(parents=True)
+    rotation = Rotation.from_euler("xyz", [20, -35, 110], degrees=True).as_matrix()
+    centre = poses[:, :3, 3].mean(axis=0)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, rotation @ -centre
+    scale = 1 / np.abs((poses[:, :3, 3] - centre) @ rotation.T).max()
+    trained = scale * ((stored - centre) @ rotation.T)
+    (made.folder / "mesh.ply").unlink()
+    folder = folder or made.folder
+    folder.mkdir(exist_ok=True)
+    write_ply(folder / name, trained, made.triangles, made.face_object)
+    said = {"transform": (transform @ matrix)[:3].tolist(), "scale": scale * larger}
+    (folder / "dataparser_transforms.json").write_text(json.dumps(said))
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    "how", [{}, {"applied": Y_UP}, {"applied": Y_UP, "applied_scale": 2.5}, {"legacy": True}]
+)
+def test_an_exported_mesh_is_brought_back(capture, how):
+    _train(capture, name="poisson_mesh.ply", **how)
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-9)
+    np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-5)
+    corners = scan.mesh.points[scan.mesh.triangles].astype(np.float64)
+    edges = corners[:, 1:] - corners[:, :1]
+    flat = np.cross(edges[:, 0], edges[:, 1])
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    np.testing.assert_allclose((scan.mesh.corner_normals * flat[:, None]).sum(axis=2), 1, atol=1e-4)
+    assert [o.identifier for o in scan.objects] == list(capture.names)
+    (said,) = (sentence for sentence in scan.warnings if "[mesh.frame]" in sentence)
+    assert "poisson_mesh.ply: dataparser_transforms.json beside it says" in said
+
+
+def test_a_mesh_elsewhere_is_brought_back_by_what_lies_beside_it(capture, tmp_path):
+    mesh = _train(capture, folder=tmp_path / "export", name="mesh.ply")
+    scan = read_scan(capture.folder, IngestOptions(mesh=mesh))
+    np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-5)
+    beside = files_beside(choose_adapter(capture.folder), capture.folder, mesh)
+    assert beside == [mesh.parent / "dataparser_transforms.json"]
+
+
+def test_an_exported_mesh_alone_says_what_is_missing(capture):
+    """No more: others call theirs so too, and who moved it back need not rename it."""
+    _train(capture, name="tsdf_mesh.ply")
+    (capture.folder / "dataparser_transforms.json").unlink()
+    scan = read_scan(capture.folder, IngestOptions())
+    (said,) = (sentence for sentence in scan.warnings if "[mesh.frame]" in sentence)
+    assert "Put dataparser_transforms.json, which lies beside the training's config.yml" in said
+
+
+def test_areas_are_those_of_the_capture(capture):
+    """Parts of less than a square metre; the training's metre is larger."""
+    document = json.loads((capture.folder / "objects.json").read_text())
+    (capture.folder / "objects.json").unlink()
+    mesh = _train(capture, name="mesh.ply")
+    points = read_scan(capture.folder, IngestOptions()).mesh.points
+    assert len(document["objects"]) > 1
+    options = IngestOptions(objects=None, min_component_area_m2=1.0)
+    before = read_scan(capture.folder, options)
+    write_ply(mesh, points, capture.triangles, capture.face_object)
+    (capture.folder / "dataparser_transforms.json").unlink()
+    after = read_scan(capture.folder, options)
+    assert [o.label for o in before.objects] == [o.label for o in after.objects]
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"transform": [[1, 0, 0, 0]] * 3, "scale": 1},
+        {"transform": np.eye(4)[:3].tolist(), "scale": 0},
+        {"transform": np.eye(4)[:3].tolist(), "scale": 1e300},
+        {"transform": [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 1},
+        {"transform": np.diag([1, 1, -1, 1])[:3].tolist(), "scale": 1},
+        {"transform": {}, "scale": 1},
+        {"scale": 1},
+        [],
+    ],
+)
+def test_a_statement_that_says_no_frame_is_refused(capture, stated):
+    _train(capture, name="mesh.ply")
+    (capture.folder / "dataparser_transforms.json").write_text(json.dumps(stated))
+    with pytest.raises(InputRefused, match=r"nobody knows where the mesh lies.*\[mesh\.frame\]$"):
+        read_scan(capture.folder, IngestOptions())
+
+
+def test_the_points_that_nerfstudio_begins_from_are_no_mesh(capture):
+    points = [" ".join(map(str, p)) for p in capture.points.tolist()]
+    head = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+    head += [*(f"property float {axis}" for axis in "xyz"), "end_header"]
+    (capture.folder / "sparse_pc.ply").write_text("\n".join([*head, *points, ""]))
+    (capture.folder / "mesh.ply").rename(capture.folder / "room.ply")
+    assert len(read_scan(capture.folder, IngestOptions()).mesh.points) == len(capture.points)
+    (capture.folder / "room.ply").unlink()
+    with pytest.raises(InputRefused, match=r"no mesh \(sparse_pc\.ply holds points alone\)\. Put"):
+        read_scan(capture.folder, IngestOptions())
+
+
+def test_the_only_mesh_beside_the_poses_is_theirs(capture):
+    (capture.folder / "mesh.ply").rename(capture.folder / "room.ply")
+    assert len(read_scan(capture.folder, IngestOptions()).mesh.points) == len(capture.points)
+    (capture.folder / "room.ply").rename(capture.folder / "room.ply.gz")
+    with pytest.raises(InputRefused, match=r"no mesh. Put mesh\.ply beside the poses, or name one"):
+        read_scan(capture.folder, IngestOptions())
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj"])
+@pytest.mark.parametrize("stated", [{}, {"scale": 0.2, "offset": [0.5, 0.3, 0.8]}])
+def test_meshes_of_instant_ngp_have_their_axes_turned_back(capture, kind, stated):
+    """As save_mesh of marching_cubes.cu writes them: (p - offset) / scale of p = (y, z, x) of
+    scale x + offset."""
+    with edited(capture.manifest) as document:
+        document.update(stated)
+    scale, offset = stated.get("scale", 0.33), np.array(stated.get("offset", [0.5] * 3))
+    inside = (capture.points * scale + offset)[:, [1, 2, 0]]
+    rows = [" ".join(f"{n:.5f}" for n in p) for p in (inside - offset) / scale]
+    (capture.folder / "mesh.ply").unlink()
+    if kind == "ply":
+        head = [
+            "ply", "format ascii 1.0",
+            "comment output from https://github.com/NVlabs/instant-ngp",
+            f"element vertex {len(rows)}", *(f"property float {axis}" for axis in "xyz"),
+            f"element face {len(capture.triangles)}", "property list uchar int vertex_index",
+            "end_header",
+        ]  # fmt: skip
+        faces = [f"3 {a} {b} {c}" for a, b, c in capture.triangles]
+        (capture.folder / "mesh.ply").write_text("\n".join([*head, *rows, *faces, ""]))
+    else:
+        faces = [f"f {a} {b} {c}" for a, b, c in capture.triangles + 1]
+        lines = ["mtllib nerf.mtl", *(f"v {row}" for row in rows), "usemtl nerf", *faces, ""]
+        (capture.folder / "fox.obj").write_text("\n".join(lines))
+    (capture.folder / "objects.json").unlink()
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-4)
+    assert any("is one of instant-ngp's" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize(
+    "stated", [{"aabb": [[0, 0, 0], [1, 1, 1]]}, {"offset": [1, 2]}, {"scale": 0}]
+)
+def test_meshes_of_instant_ngp_that_lie_anywhere_are_refused(capture, stated):
+    with edited(capture.manifest) as document:
+        document.update(stated)
+    mesh = capture.folder / "mesh.obj"
+    mesh.write_text("mtllib nerf.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(InputRefused, match=r"do not say where it lies.*\[mesh\.frame\]$"):
+        read_scan(capture.folder, IngestOptions(mesh=mesh))

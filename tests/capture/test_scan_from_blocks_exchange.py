@@ -1,0 +1,249 @@
+"""BlocksExchange XML, written after Bentley's documentation of the format (CC Orientations) and its
+annotated sample of Paris."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.format_truth import (
+    HEIGHT,
+    WIDTH,
+    assert_bends,
+    assert_same,
+    truth,
+    write_image,
+    write_obj,
+)
+from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
+from usdbrdf.capture.reconstructions.blocks_exchange import shots_of
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.tables import read_xml
+from usdbrdf.options import IngestOptions
+
+OPTIONS = IngestOptions(assume_srgb=True)
+ENU = "ENU:39.97523,-83.00678"
+# What the pictures' right, down and away from the camera are called, by the names of x and y.
+SIDES = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
+
+
+def _rotation(turn, how):
+    if how == "angles":  # R = (Rx(omega) Ry(phi) Rz(kappa))^T
+        omega, phi = np.arctan2(-turn.T[1, 2], turn.T[2, 2]), np.arcsin(turn.T[0, 2])
+        kappa = np.arctan2(-turn.T[0, 1], turn.T[0, 0])
+        named = zip(("Omega", "Phi", "Kappa"), np.degrees([omega, phi, kappa]), strict=True)
+    else:
+        named = ((f"M_{i}{k}", turn[i, k]) for i in range(3) for k in range(3))
+    return "".join(f"<{name}>{float(number)!r}</{name}>" for name, number in named)
+
+
+def _document(room, *, axes="XRightYDown", how="matrix", origin=(0, 0, 0), camera=None, extra=""):
+    x, y = (np.array(SIDES[word], float) for word in axes[1:].split("Y"))
+    sides = np.stack([x, y, np.cross(x, y)])
+    fx, _, cx, cy = room.intrinsics[0].tolist()
+    camera = camera or (
+        f"<FocalLengthPixels>{fx}</FocalLengthPixels>"
+        f"<PrincipalPoint><x>{cx - 0.5}</x><y>{cy - 0.5}</y></PrincipalPoint>"
+    )
+    photos = []
+    for i, pose in enumerate(room.opencv):
+        turn = sides @ pose[:3, :3].T
+        place = pose[:3, 3] + origin
+        centre = "".join(f"<{a}>{float(n)!r}</{a}>" for a, n in zip("xyz", place, strict=True))
+        photos.append(
+            f"<Photo><Id>{i}</Id><ImagePath>D:/Work/undistorted photos/{i:04d}.jpg</ImagePath>"
+            f"<Component>1</Component><Pose><Rotation>{_rotation(turn, how)}"
+            f"<Accurate>true</Accurate></Rotation><Center>{centre}</Center>"
+            "<Metadata><SRSId>0</SRSId><Center><x>-83</x><y>39</y><z>157</z></Center></Metadata>"
+            "</Pose></Photo>"
+        )
+    return (
+        '<?xml version="1.0" encoding="utf-8"?>\n<BlocksExchange version="3.2">'
+        "<SpatialReferenceSystems><SRS><Id>0</Id><Name>WGS 84</Name>"
+        "<Definition>EPSG:4326+5773</Definition></SRS>"
+        f"<SRS><Id>2</Id><Name>Local</Name><Definition>{ENU}</Definition></SRS>"
+        "</SpatialReferenceSystems><Block><Name>Block_1 - AT</Name><SRSId>2</SRSId><Photogroups>"
+        "<Photogroup><Name>1</Name><ImageDimensions>"
+        f"<Width>{WIDTH}</Width><Height>{HEIGHT}</Height></ImageDimensions>"
+        "<CameraModelType>Perspective</CameraModelType><CameraModelBand>Visible</CameraModelBand>"
+        f"{camera}<CameraOrientation>{axes}</CameraOrientation>{extra}"
+        "<AspectRatio>1</AspectRatio><Skew>0</Skew>"
+        f"{''.join(photos)}</Photogroup></Photogroups></Block></BlocksExchange>"
+    )
+
+
+def _write(folder, room, document, mesh="mesh.obj"):
+    for i, image in enumerate(room.images):
+        write_image(folder / "images" / f"{i:04d}.jpg", image)
+    (folder / mesh).parent.mkdir(parents=True, exist_ok=True)
+    write_obj(folder / mesh, room)
+    (folder / "block.xml").write_text(document)
+
+
+def _shots(tmp_path, document):
+    (tmp_path / "block.xml").write_text(document)
+    return list(shots_of(read_xml(tmp_path / "block.xml"), np.zeros(3), tmp_path / "block.xml"))
+
+
+@pytest.mark.parametrize("how", ["matrix", "angles"])
+@pytest.mark.parametrize("axes", ["XRightYDown", "XRightYUp", "XLeftYDown", "XDownYLeft"])
+def test_the_block_is_the_room(tmp_path, axes, how):
+    room = truth().square()
+    _write(tmp_path, room, _document(room, axes=axes, how=how))
+    assert choose_adapter(tmp_path / "block.xml").name == "blocks-exchange"
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, room, names=room.names)
+    assert not any("[capture.unit]" in said for said in scan.warnings)
+
+
+def test_angles_are_those_of_the_sample_of_the_format(tmp_path):
+    """The one photograph of which it states both."""
+    angles = "<Omega>179.6523471469934</Omega><Phi>0.04985630236313049</Phi>"
+    angles += "<Kappa>179.9065465708369</Kappa>"
+    room = truth()
+    document = _document(room)
+    first = document.index("<M_00>")
+    changed = document[:first] + angles + document[document.index("<Accurate>") :]
+    found = _shots(tmp_path, changed)[0].world_from_camera[:3, :3].T
+    expected = [
+        [-0.9999982912233401, -0.001636319085375301, -0.0008602425863163225],
+        [-0.001631068695467463, 0.9999802528616577, -0.00606906089589293],
+        [0.0008701565192966738, -0.006067647409696231, -0.9999812130648239],
+    ]
+    np.testing.assert_allclose(found, expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("given", ["beside", "above the model"])
+def test_models_have_an_origin_of_their_own(tmp_path, given):
+    """As those of projected coordinates, of which single precision would keep decimetres."""
+    room, origin = truth().square(), (512_000.25, 4_400_000.5, 150.0)
+    tile = "Data/Tile_+000_+000/Tile_+000_+000.obj"
+    base, made = tmp_path / "capture", tmp_path / "made"
+    _write(base, room, _document(room, origin=origin), tile if given == "beside" else "mesh.obj")
+    folder = base if given == "beside" else made / "Production_1"
+    if given != "beside":
+        (base / "mesh.obj").unlink()
+        (folder / tile).parent.mkdir(parents=True)
+        write_obj(folder / tile, room)
+    text = f"<SRS>enu: 39.97523, -83.00678</SRS><SRSOrigin>{','.join(map(str, origin))}</SRSOrigin>"
+    (folder / "metadata.xml").write_text(f"<ModelMetadata version='1'>{text}</ModelMetadata>")
+    mesh = None if given == "beside" else folder / tile
+    scan = read_scan(base, IngestOptions(assume_srgb=True, mesh=mesh))
+    assert_same(scan, room)
+    if mesh is not None:
+        beside = files_beside(choose_adapter(base), base, mesh)
+        assert beside == [folder / "metadata.xml"]
+
+
+def test_millimetres_are_of_the_longer_side(tmp_path):
+    room = truth().square()
+    fx, _, cx, cy = room.intrinsics[0].tolist()
+    mm = 23.5 / WIDTH
+    camera = (
+        f"<SensorSize>23.5</SensorSize><FocalLength>{fx * mm}</FocalLength>"
+        f"<PrincipalPoint><xmm>{(cx - WIDTH / 2) * mm}</xmm><ymm>{(HEIGHT / 2 - cy) * mm}</ymm>"
+        "</PrincipalPoint>"
+    )
+    for said in (
+        camera,
+        camera.replace("SensorSize>23.5</SensorSize", f"PixelSize>{mm}</PixelSize"),
+    ):
+        found = _shots(tmp_path, _document(room, axes="XRightYUp", camera=said))[0].camera
+        np.testing.assert_allclose(found.intrinsics, room.intrinsics[0], atol=1e-9)
+    found = _shots(tmp_path, _document(room, camera=camera.split("<PrincipalPoint>")[0]))[0].camera
+    np.testing.assert_allclose(found.intrinsics[2:], (WIDTH / 2, HEIGHT / 2))
+
+
+def _brown(plane, terms):
+    """Brown's model as the format's documentation refers to it: P1 goes with r^2 + 2 x^2."""
+    (x, y), (k1, k2, k3, p1, p2) = plane, terms
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    return (
+        x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y,
+        y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y,
+    )
+
+
+def test_distortions_are_those_of_the_format(tmp_path):
+    room, terms = truth().square(), (-0.1, 0.02, 0.01, 0.004, -0.003)
+    named = zip(("K1", "K2", "K3", "P1", "P2"), terms, strict=True)
+    said = "".join(f"<{name}>{number}</{name}>" for name, number in named)
+    shots = _shots(tmp_path, _document(room, extra=f"<Distortion>{said}</Distortion>"))
+    assert_bends(shots[0].camera, room, _brown, terms)
+
+
+def test_spheres(tmp_path):
+    document = _document(truth()).replace(">Perspective<", ">Spherical<")
+    camera = _shots(tmp_path, document)[0].camera
+    assert (camera.lens.curve, camera.resolution) == ("equirectangular", (WIDTH, HEIGHT))
+
+
+def test_photographs_that_were_not_placed_are_left_out(tmp_path):
+    room = truth().square()
+    parts = _document(room).split("<Photo>")
+    parts[3] = parts[3].replace("<Component>1<", "<Component>0<")
+    parts[5] = parts[5].replace("<M_11>", "<M_11>nan ")
+    _write(tmp_path, room, "<Photo>".join(parts))
+    scan = read_scan(tmp_path, OPTIONS)
+    assert len(scan.frames) == 8
+    assert any("it is of no component of the block" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (">Perspective<", ">Fisheye<", "cameras of the type 'Fisheye' are not read"),
+        ("<Skew>0<", "<Skew>0.5<", "cameras with AspectRatio or Skew are not read"),
+        ("<SRSId>2<", "<SRSId>0<", r"its coordinates are longitudes and latitudes \(EPSG:4326"),
+        (f">{ENU}<", ">WGS84<", "its coordinates are longitudes and latitudes"),
+        ("<Rotation>", "<Rot>", "not valid XML"),
+        ("Rotation>", "Rot>", "no photograph with rotation and centre"),
+        ("<BlocksExchange", "<!DOCTYPE a><BlocksExchange", "an XML document with a document type"),
+        ("XRightYDown", "XRightYLeft", "only 0 of 10 frames can be used"),
+        ("FocalLengthPixels>", "Focal>", "only 0 of 10 frames can be used"),
+    ],
+)
+def test_what_is_not_read_is_refused(tmp_path, old, new, said):
+    room = truth().square()
+    _write(tmp_path, room, _document(room).replace(old, new))
+    with pytest.raises(InputRefused, match=said):
+        read_scan(tmp_path, OPTIONS)
+
+
+def test_a_model_in_tiles_or_of_another_system_is_refused(tmp_path):
+    room = truth().square()
+    _write(tmp_path, room, _document(room), "Data/Tile_0/Tile_0.obj")
+    (tmp_path / "Data/Tile_1").mkdir()
+    write_obj(tmp_path / "Data/Tile_1/Tile_1.obj", room)
+    with pytest.raises(InputRefused, match="Its model is in 2 tiles: produce it without tiling"):
+        read_scan(tmp_path, OPTIONS)
+    for text, said in (
+        (
+            "<SRS>EPSG:32617</SRS>",
+            "is in the coordinate system EPSG:32617, the cameras of block.xml",
+        ),
+        (f"<SRS>{ENU}</SRS><SRSOrigin>1,2</SRSOrigin>", "SRSOrigin is '1 2', not three numbers"),
+        (f"<SRS>{ENU}</SRS><SRSOrigin>1,2,inf</SRSOrigin>", "not three numbers"),
+    ):
+        (tmp_path / "metadata.xml").write_text(f"<ModelMetadata>{text}</ModelMetadata>")
+        with pytest.raises(InputRefused, match=said):
+            read_scan(tmp_path, OPTIONS)
+
+
+@pytest.mark.parametrize(
+    "system", ["LOCAL_CS[&quot;Local (m)&quot;]", "WGS 84 / UTM zone 17N", "PROJCS[&quot;WGS 84"]
+)
+def test_systems_whose_coordinates_are_lengths_are_read(tmp_path, system):
+    room = truth().square()
+    _write(tmp_path, room, _document(room).replace(f">{ENU}<", f">{system}<"))
+    assert_same(read_scan(tmp_path, OPTIONS), room)
+
+
+def test_of_several_blocks_the_one_with_most_poses_is_read(tmp_path):
+    room = truth().square()
+    other = "<Block><Name>Block_1</Name><Photogroups/></Block><Block><Name>"
+    _write(tmp_path, room, _document(room).replace("<Block><Name>", other))
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, room)
+    assert any("2 blocks; taken is 'Block_1 - AT'" in said for said in scan.warnings)

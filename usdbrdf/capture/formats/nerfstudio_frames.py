@@ -1,0 +1,186 @@
+"""The frames of nerfstudio: that of transforms.json, and the one that it trains in, in which the
+meshes lie that it exports (``ns-export``); and that of the meshes of instant-ngp.
+
+``dataparser_transforms.json`` of a training says how its frame follows: a ``transform`` from the
+world before ``applied_transform``, and a ``scale``. It lies beside the training's config.yml, not
+beside the mesh, so it has to be brought there.
+
+instant-ngp scales and moves the world, and turns its axes in a circle (x, y, z are y, z, x of the
+document); its meshes have scale and offset undone, but neither the turn nor, in the offset, its
+order (nerf_loader.h, marching_cubes.cu).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.documents import read_json
+from usdbrdf.files.tables import beginning_of, numbers_among
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.mesh import ScanGeometry
+from usdbrdf.options import CaptureOptions
+from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
+
+FILE = "dataparser_transforms.json"
+# What its exporters call their meshes, but for mesh.obj, which anybody's may be called.
+EXPORTED = ("poisson_mesh.ply", "tsdf_mesh.ply", "sdf_marching_cubes_mesh.ply")
+_LARGEST = 1e9  # number that makes sense in a matrix
+# By which instant-ngp's meshes are known, PLY and OBJ; what it takes where a document says nothing.
+_OF_NGP = (b"output from https://github.com/NVlabs/instant-ngp", b"mtllib nerf.mtl")
+_NGP_SCALE, _NGP_OFFSET = 0.33, 0.5
+_NGP_AXES = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Applied:
+    """How the world of transforms.json follows from that in which the mesh was made.
+
+    matrix  (4, 4) rigid: applied_transform
+    scale   by which it was made larger then: applied_scale
+    """
+
+    matrix: Double
+    scale: float
+
+    @property
+    def similarity(self) -> Double:
+        """(4, 4) from the one to the other."""
+        enlarged = np.diag([self.scale] * 3 + [1.0])
+        return np.asarray(enlarged @ self.matrix, np.float64)
+
+    def undone(self, pose: Double) -> Double:
+        """A pose (4, 4) of the document before that."""
+        found = pose.copy()
+        found[:3, 3] /= self.scale
+        return np.asarray(np.linalg.inv(self.matrix) @ found, np.float64)
+
+
+def stated_pose(matrix: object) -> Double | None:
+    """(4, 4) of 3 or 4 rows, None where they are no numbers that a pose may have."""
+    try:
+        pose = np.array(matrix, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0.0, 0, 0, 1]])
+    return pose if pose.shape == (4, 4) and (np.abs(pose) <= LARGEST_OF_POSE).all() else None
+
+
+def rigid_matrix(stated: object) -> Double | None:
+    """(4, 4) of what states 3 or 4 rows of it, None where it is no rotation with a translation."""
+    matrix = stated_pose(stated)
+    if matrix is None or not is_camera_matrix(matrix):
+        return None
+    turn = matrix[:3, :3]
+    sound = np.abs(turn @ turn.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(turn) > 0
+    return matrix if sound else None
+
+
+def statements_beside(mesh: Path) -> list[Path]:
+    """The files that say where a mesh of nerfstudio lies, as far as they are there."""
+    statement = mesh.resolve().parent / FILE
+    return [statement] if statement.is_file() else []
+
+
+def geometry_at_home(
+    mesh: Path,
+    read: Callable[[CaptureOptions], ScanGeometry],
+    options: CaptureOptions,
+    findings: Findings,
+    applied: Applied,
+    document: Mapping[str, Any],
+    *,
+    meters_per_unit: float,
+) -> ScanGeometry:
+    """What is read of a mesh, in the frame of the capture if it lay in that of a training on the
+    document's.
+
+    read             is given options whose unit is the mesh's own
+    meters_per_unit  of the capture, unless the options say it
+    """
+    if any(mark in beginning_of(mesh) for mark in _OF_NGP) and not document.get("from_mitsuba"):
+        findings.warn(
+            f"{mesh.name}: is one of instant-ngp's, whose axes it turns; they are turned back. "
+            "[mesh.frame]"
+        )
+        home = np.linalg.inv(applied.similarity) @ _document_from_ngp(mesh, document)
+        return _moved(read, np.asarray(home, np.float64), options, meters_per_unit)
+    statements = statements_beside(mesh)
+    if not statements or mesh.suffix.lower() in USD_SUFFIXES:
+        if mesh.name in EXPORTED:
+            findings.warn(
+                f"{mesh.name}: is called as nerfstudio exports its meshes, which lie in the frame "
+                f"that it trained in. Put {FILE}, which lies beside the training's config.yml, "
+                "beside it, unless this one has been moved back. [mesh.frame]"
+            )
+        return read(options)
+    trained = _trained_from_capture(statements[0], applied)
+    matrix = np.asarray(np.linalg.inv(trained), np.float64)
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    findings.warn(
+        f"{mesh.name}: {FILE} beside it says that it lies in the frame that nerfstudio trained in; "
+        f"it is brought back, {scale:.3g} times as large. Remove that file if the mesh has been "
+        "moved back already. [mesh.frame]"
+    )
+    return _moved(read, matrix, options, meters_per_unit)
+
+
+def _moved(
+    read: Callable[[CaptureOptions], ScanGeometry],
+    matrix: Double,
+    options: CaptureOptions,
+    meters_per_unit: float,
+) -> ScanGeometry:
+    """What is read, by a similarity (4, 4)."""
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    unit = (options.meters_per_unit or meters_per_unit) * scale
+    found = read(replace(options, meters_per_unit=unit))
+    points = found.mesh.points @ matrix[:3, :3].T + matrix[:3, 3]
+    normals = found.mesh.corner_normals @ (matrix[:3, :3].T / scale)
+    moved = replace(
+        found.mesh, points=points.astype(np.float32), corner_normals=normals.astype(np.float32)
+    )
+    return replace(found, mesh=moved)
+
+
+def _trained_from_capture(statement: Path, applied: Applied) -> Double:
+    """(4, 4) similarity."""
+    document: Any = read_json(statement)
+    row: Mapping[str, Any] = document if isinstance(document, dict) else {}
+    matrix, scale = rigid_matrix(row.get("transform")), numbers_among(row.get("scale"), 1)
+    if matrix is None or scale is None or not 1 / _LARGEST < scale[0] < _LARGEST:
+        raise InputRefused(
+            f"{statement}: transform is no rigid matrix of 3 x 4, or scale no positive number, so "
+            "nobody knows where the mesh lies. Bring that of the training again, or remove it if "
+            "the mesh lies in the frame of the poses. [mesh.frame]"
+        )
+    # The matrix leads from the capture's frame, but what it was found of, and moved, were the
+    # document's poses, larger ones; the scale is that of both steps.
+    trained = np.diag([scale[0] / applied.scale] * 3 + [1.0])
+    inner = matrix @ np.linalg.inv(applied.matrix)
+    return np.asarray(trained @ inner @ applied.similarity, np.float64)
+
+
+def _document_from_ngp(mesh: Path, document: Mapping[str, Any]) -> Double:
+    """(4, 4) rigid."""
+    offset = document.get("offset", _NGP_OFFSET)
+    numbers = numbers_among(offset if isinstance(offset, list) else [offset] * 3, 3)
+    scale = numbers_among(document.get("scale", _NGP_SCALE), 1)
+    stated = numbers is not None and scale is not None and 1 / _LARGEST < scale[0] < _LARGEST
+    if numbers is None or scale is None or not stated or "aabb" in document:
+        raise InputRefused(
+            f"{mesh}: is one of instant-ngp's, and the document's scale and offset, or aabb, do "
+            "not say where it lies. Move it into the frame of the poses, and save it again. "
+            "[mesh.frame]"
+        )
+    ngp_from_document = _NGP_AXES.copy()
+    ngp_from_document[:3, 3] = (np.roll(numbers, -1) - numbers) / scale[0]
+    return np.asarray(np.linalg.inv(ngp_from_document), np.float64)

@@ -1,0 +1,231 @@
+"""BlocksExchange XML of ContextCapture (iTwin Capture Modeler), which Metashape, DJI Terra and
+others write too: groups of photographs with one camera each; a model that was made in their frame.
+
+A pose is the rotation from the world to the camera, whose axes CameraOrientation names (without it
+OpenCV's), and the camera's centre. Pixels are counted from the middle of the first one. Models have
+the origin that ``metadata.xml`` of their production states.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.formats.named_pictures import rigid_pose
+from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, scan_of_shots
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.tables import Element, beginning_of_text, files_of, numbers_of, read_xml
+from usdbrdf.model.arrays import Double
+from usdbrdf.model.capture import Scan
+from usdbrdf.model.lens import Lens, whole_sphere
+from usdbrdf.options import CaptureOptions
+
+NAME = "blocks-exchange"
+DESCRIPTION = DESCRIPTIONS[NAME]
+_METADATA = "metadata.xml"
+# How deep a tile of a production lies below what tells of all.
+_ABOVE = 3
+_AXES = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
+# Coordinate systems whose coordinates are no lengths along three axes.
+_DEGREES = re.compile(r"EPSG: *(4326|4979)\b|\+proj=longlat|^\s*(WGS ?84\s*$|GEOG(CS|CRS))", re.I)
+
+
+def matches(path: Path) -> bool:
+    """Such a document, or a folder with one."""
+    return bool(_documents(path))
+
+
+def _documents(path: Path) -> list[Path]:
+    return [f for f in files_of(path, [".xml"]) if "<BlocksExchange" in beginning_of_text(f)]
+
+
+def read(path: Path, options: CaptureOptions) -> Scan:
+    documents, findings = _documents(path.resolve()), Findings()
+    if len(documents) != 1:
+        said = f"{len(documents)} of them" if documents else "no BlocksExchange XML"
+        raise InputRefused(
+            f"{path}: {said}. Name the file that was exported of the aerotriangulation. "
+            "[capture.format]"
+        )
+    (source,) = documents
+    root = read_xml(source)
+    block = _block(root, source, findings)
+    systems = {_text(row, "Id"): _text(row, "Definition") for row in root.iter("SRS")}
+    system = systems.get(_text(block, "SRSId"), "")
+    tiles = sorted(source.parent.glob("Data/*/*.obj"))
+    return scan_of_shots(
+        shots_of(block, _origin(source, system, options), source),
+        options,
+        findings,
+        adapter=NAME,
+        source=source,
+        folder=source.parent,
+        meshes=("mesh.*", "model.*", *(["Data/*/*.obj"] if len(tiles) == 1 else [])),
+        how=f"Its model is in {len(tiles)} tiles: produce it without tiling"
+        if len(tiles) > 1
+        else "Put the model that was made in this block's coordinate system into this folder, with "
+        f"{_METADATA} of its production",
+        in_metres=bool(system),
+    )
+
+
+def beside_mesh(mesh: Path) -> list[Path]:
+    """The file that says the origin of a model."""
+    above = mesh.resolve().parents[:_ABOVE]
+    return [folder / _METADATA for folder in above if (folder / _METADATA).is_file()][:1]
+
+
+def _block(root: Element, source: Path, findings: Findings) -> Element:
+    """The one with most poses, of which there must be some."""
+    blocks = list(root.iter("Block"))
+    posed = [sum(_pose(photo, "") is not None for photo in block.iter("Photo")) for block in blocks]
+    if not any(posed):
+        raise InputRefused(
+            f"{source}: no photograph with rotation and centre. Export the block of the "
+            "aerotriangulation. [capture.alignment]"
+        )
+    chosen = blocks[int(np.argmax(posed))]
+    if len(blocks) > 1:
+        findings.warn(
+            f"{source.name}: {len(blocks)} blocks; taken is {_text(chosen, 'Name')[:80]!r}, which "
+            f"has most poses, {max(posed)}. [capture.format]"
+        )
+    return chosen
+
+
+def _origin(source: Path, system: str, options: CaptureOptions) -> Double:
+    """Of the model, in the block's coordinates; InputRefused where these are two systems."""
+    if _DEGREES.search(system):
+        raise InputRefused(
+            f"{source}: its coordinates are longitudes and latitudes ({system[:40]}). Export the "
+            "block in a local or projected coordinate system. [capture.unit]"
+        )
+    stated = [source.parent / _METADATA] if (source.parent / _METADATA).is_file() else []
+    stated += beside_mesh(options.mesh) if options.mesh is not None else []
+    if not stated:
+        return np.zeros(3)
+    root = read_xml(stated[-1])
+    theirs, ours = (re.sub(r"\s", "", one).upper() for one in (_text(root, "SRS"), system))
+    if theirs and ours and theirs != ours:
+        raise InputRefused(
+            f"{stated[-1]}: the model is in the coordinate system {theirs[:60]}, the cameras of "
+            f"{source.name} are in {ours[:60]}. Export both in one. [capture.unit]"
+        )
+    words = _text(root, "SRSOrigin").replace(",", " ").split()
+    try:
+        origin = np.array(words or (0, 0, 0), np.float64)
+    except ValueError:
+        origin = np.zeros(0)
+    if origin.shape != (3,) or not np.isfinite(origin).all():
+        raise InputRefused(
+            f"{stated[-1]}: SRSOrigin is {' '.join(words)[:60]!r}, not three numbers. Bring the "
+            "file of the model's production again. [document.xml]"
+        )
+    return origin
+
+
+def _text(element: Element, name: str) -> str:
+    return (element.findtext(name) or "").strip()
+
+
+def _number(element: Element, name: str) -> float | None:
+    numbers = numbers_of(element.find(name), 1)
+    return None if numbers is None else float(numbers[0])
+
+
+def shots_of(block: Element, origin: Double, source: Path) -> Iterator[Shot]:
+    """The photographs of a block, in the frame whose origin that is."""
+    for group in block.iter("Photogroup"):
+        unset = _text(group, "ManualPose").lower() == "false"
+        camera, axes = _camera(group, source), _text(group, "CameraOrientation")
+        for photo in group.iter("Photo"):
+            pose = None if unset else _pose(photo, axes)
+            if pose is not None:
+                pose[:3, 3] -= origin
+            apart = _text(photo, "Component") == "0"
+            yield Shot(
+                name=_text(photo, "ImagePath"),
+                camera=camera,
+                world_from_camera=pose,
+                problem="it is of no component of the block" if apart and pose is not None else "",
+            )
+
+
+def _camera_from_opencv(axes: str) -> Double:
+    """(3, 3): the axes of a group's cameras, whose z is what their x and y make of it; NaN for
+    words that name none."""
+    words = re.fullmatch(r"X(Right|Left|Down|Up)Y(Right|Left|Down|Up)", axes or "XRightYDown")
+    x, y = (np.array(_AXES[word], np.float64) for word in words.groups()) if words else (0, 0)
+    rows = np.stack([x, y, np.cross(x, y)]) if words else np.zeros((3, 3))
+    return rows if abs(np.linalg.det(rows)) > 0 else np.full((3, 3), np.nan)
+
+
+def _pose(photo: Element, axes: str) -> Double | None:
+    """(4, 4) world from camera, OpenCV's axes."""
+    centre = [_number(photo, f"Pose/Center/{axis}") for axis in "xyz"]
+    entries = [_number(photo, f"Pose/Rotation/M_{i}{k}") for i in range(3) for k in range(3)]
+    angles = [_number(photo, f"Pose/Rotation/{name}") for name in ("Omega", "Phi", "Kappa")]
+    if None not in entries:
+        camera_from_world = np.array(entries, np.float64).reshape(3, 3)
+    elif None not in angles:
+        stated = np.radians(np.array(angles, np.float64))
+        camera_from_world = Rotation.from_euler("XYZ", stated).as_matrix().T
+    else:
+        return None
+    opencv_from_world = _camera_from_opencv(axes).T @ camera_from_world
+    if None in centre or not np.isfinite(opencv_from_world).all():
+        return None
+    return rigid_pose(opencv_from_world.T, np.array(centre, np.float64))
+
+
+def _camera(group: Element, source: Path) -> ShotCamera | None:
+    width, height = (_number(group, f"ImageDimensions/{side}") for side in ("Width", "Height"))
+    if width is None or height is None or not min(width, height) >= 1:
+        return None
+    size = int(width), int(height)
+    kind = _text(group, "CameraModelType") or "Perspective"
+    if kind == "Spherical":
+        whole = Lens(curve="equirectangular")
+        return ShotCamera(resolution=size, intrinsics=whole_sphere(*size), lens=whole)
+    uneven = abs((_number(group, "AspectRatio") or 1.0) - 1) > 1e-6 or _number(group, "Skew")
+    if kind != "Perspective" or uneven:
+        said = f"of the type {kind[:40]!r}" if kind != "Perspective" else "with AspectRatio or Skew"
+        raise InputRefused(
+            f"{source}: cameras {said} are not read (known: Perspective with square pixels, and "
+            "Spherical). Export undistorted photographs with their own block. [capture.camera]"
+        )
+    focal, centre = _in_pixels(group, size)
+    terms = [_number(group, f"Distortion/{name}") or 0.0 for name in ("K1", "K2", "K3")]
+    p1, p2 = (_number(group, f"Distortion/{name}") or 0.0 for name in ("P1", "P2"))
+    if focal is None or not focal > 0:
+        return None
+    return ShotCamera(
+        resolution=size,
+        intrinsics=(focal, focal, *centre),
+        # P1 goes with r^2 + 2 x^2, which OpenCV's p2 does.
+        lens=Lens(radial=tuple(terms), tangential=(p2, p1)),
+    )
+
+
+def _in_pixels(group: Element, size: tuple[int, int]) -> tuple[float | None, tuple[float, float]]:
+    """Focal length and principal point, the latter from the picture's corner."""
+    focal, sensor = _number(group, "FocalLength"), _number(group, "SensorSize")
+    pixel = _number(group, "PixelSize") or (sensor / max(size) if sensor else None)
+    if focal is not None and pixel:
+        focal /= pixel
+    focal = _number(group, "FocalLengthPixels") or (focal if pixel else None)
+    x, y = (_number(group, f"PrincipalPoint/{axis}") for axis in "xy")
+    if x is not None and y is not None:
+        return focal, (x + 0.5, y + 0.5)
+    offsets = [_number(group, f"PrincipalPoint/{axis}mm") for axis in "xy"]
+    right, down = 0.0, 0.0
+    if pixel and None not in offsets:
+        of_opencv = _camera_from_opencv(_text(group, "CameraOrientation")).T
+        right, down, _ = (of_opencv @ [*offsets, 0.0] / pixel).tolist()
+    return focal, (size[0] / 2 + right, size[1] / 2 + down)
