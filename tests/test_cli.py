@@ -232,6 +232,24 @@ def test_names_longer_than_the_system_allows(output, capture, tmp_path, capsys):
 
 
 @pytest.mark.fault("R17")
+def test_an_empty_word_is_neither_the_default_nor_the_current_folder(
+    capture, tmp_path, capsys, monkeypatch
+):
+    """As a variable of a shell is that was never set."""
+    monkeypatch.chdir(tmp_path)
+    for subject, arguments in {
+        "-o": ["convert", capture, "-o", ""],
+        "--output": ["convert", capture, "--output="],
+        "''": ["convert", "", "-o", "a"],
+        "--mesh": ["convert", capture, "-o", "a", "--mesh", ""],
+        "--rays": ["convert", capture, "-o", "a", "--rays="],
+    }.items():
+        status, line = refused(capsys, *arguments)
+        assert (status, f"usdbrdf: {subject}: nothing is given" in line) == (2, True)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.fault("R17")
 def test_paths_that_nobody_can_follow(capture, tmp_path, capsys):
     (tmp_path / "loop").symlink_to("loop")
     for arguments in (["convert", capture, "-o", tmp_path / "loop/out"], ["validate", "loop"]):
