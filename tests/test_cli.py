@@ -237,15 +237,16 @@ def test_an_empty_word_is_neither_the_default_nor_the_current_folder(
 ):
     """As a variable of a shell is that was never set."""
     monkeypatch.chdir(tmp_path)
-    for subject, arguments in {
-        "-o": ["convert", capture, "-o", ""],
-        "--output": ["convert", capture, "--output="],
-        "''": ["convert", "", "-o", "a"],
-        "--mesh": ["convert", capture, "-o", "a", "--mesh", ""],
-        "--rays": ["convert", capture, "-o", "a", "--rays="],
-    }.items():
+    for subject, arguments in [
+        ("-o", ["convert", capture, "-o", ""]),
+        ("--output", ["convert", capture, "--output="]),
+        ("''", ["convert", "", "-o", "a"]),
+        ("''", ["validate", ""]),
+        ("--mesh", ["convert", capture, "-o", "a", "--mesh", ""]),
+        ("--rays", ["convert", capture, "-o", "a", "--rays="]),
+    ]:
         status, line = refused(capsys, *arguments)
-        assert (status, f"usdbrdf: {subject}: nothing is given" in line) == (2, True)
+        assert (status, f"usdbrdf: {subject}: the word given here is empty" in line) == (2, True)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -79,8 +79,8 @@ def _refuse_empty(words: Sequence[str]) -> None:
         if not value and (equals or not option):
             subject = option or (before if before.startswith("-") else "") or "''"
             raise UsageError(
-                f"{subject}: nothing is given here, not even a space. Give a value, or leave the "
-                "option out. [usage.option]"
+                f"{subject}: the word given here is empty. Give a value, or leave it out. "
+                "[usage.option]"
             )
 
 

@@ -15,8 +15,8 @@ from usdbrdf.evaluation.report import (
     output_folder,
     write_document,
     write_plot,
+    write_prose,
     write_table,
-    write_text,
 )
 from usdbrdf.files.documents import read_json, write_json
 
@@ -117,7 +117,7 @@ def test_killed_at_any_change_the_next_run_knows_the_folder_and_nobody_reads_a_m
     ("name", "write_result"),
     [
         ("a.csv", lambda work: write_table(work / "a.csv", ROWS)),
-        ("a.md", lambda work: write_text(work / "a.md", "x" * 10_000)),
+        ("a.md", lambda work: write_prose(work / "a.md", "x" * 10_000)),
         ("a.png", lambda work: write_plot(work / "a.png", ROWS)),
         ("a.svg", lambda work: write_plot(work / "a.svg", ROWS)),
         (DOCUMENT, lambda work: write_document(work, DOCUMENT, {"rows": ROWS})),

@@ -156,7 +156,7 @@ def parts_of_sheet(whole: Float, rows: int, columns: int) -> list[Float]:
     return [whole[top : top + height, left : left + width] for top, left in corners]
 
 
-def write_text(path: Path, text: str) -> None:
+def write_prose(path: Path, text: str) -> None:
     """A result. EnvironmentFailure where the disk does not take it."""
     with environment_failures(str(path)):
         write_text_atomic(path, text)
@@ -164,7 +164,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_table(path: Path, rows: Sequence[Row]) -> None:
     """The same rows for programs, as CSV."""
-    write_text(path, table_text(rows))
+    write_prose(path, table_text(rows))
 
 
 def write_document(work: Path, document: str, found: dict[str, Any]) -> None:

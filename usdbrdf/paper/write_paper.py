@@ -79,7 +79,7 @@ def write_paper(
             found["relighting"] = figures.write_relit(
                 work / "figures/fig10_relighting.png", places, camera, chosen
             )
-        report.write_text(work / "paper.md", paper_text(found, report.files_of(work)))
+        report.write_prose(work / "paper.md", paper_text(found, report.files_of(work)))
         report.write_document(work, DOCUMENT, found)
     return found
 

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf
 
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.compose import named_files, open_edited
+from usdbrdf.asset.readers.compose import open_edited, recorded_photographs
 from usdbrdf.asset.readers.render_scene import (
     eye_height,
     render_scene_from_stage,
@@ -176,10 +175,7 @@ def _refuse_inputs(targets: Sequence[Path], asset: Asset, options: RelightOption
     made from."""
     given = [options.lights, *(insert.model for insert in options.inserts)]
     inputs = {os.path.realpath(file) for file in given if file is not None}
-    where = asset.photographs_layer
-    if where.is_file():
-        names = named_files(Sdf.Layer.FindOrOpen(str(where)))
-        inputs |= {os.path.realpath(where.parent / name) for name in names}
+    inputs |= {os.path.realpath(photograph) for photograph in recorded_photographs(asset)}
     for target in targets:
         if os.path.realpath(target) in inputs:
             raise OwnershipConflict(

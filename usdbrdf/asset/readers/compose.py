@@ -181,6 +181,14 @@ def named_files(layer: Sdf.Layer) -> set[str]:
     return found - {""}
 
 
+def recorded_photographs(asset: Asset) -> list[Path]:
+    """Where the photographs and masks of an asset lie, that has been opened; none are read."""
+    layer = asset.photographs_layer
+    if not layer.is_file():
+        return []
+    return [layer.parent / name for name in sorted(named_files(Sdf.Layer.FindOrOpen(str(layer))))]
+
+
 def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
     for layer in layers:
         if not layer.is_file():
