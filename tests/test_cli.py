@@ -232,6 +232,40 @@ def test_names_longer_than_the_system_allows(output, capture, tmp_path, capsys):
 
 
 @pytest.mark.fault("R17")
+def test_an_empty_word_is_neither_the_default_nor_the_current_folder(
+    capture, tmp_path, capsys, monkeypatch
+):
+    """As a variable of a shell is that was never set."""
+    monkeypatch.chdir(tmp_path)
+    for subject, arguments in [
+        ("-o", ["convert", capture, "-o", ""]),
+        ("--output", ["convert", capture, "--output="]),
+        ("''", ["convert", "", "-o", "a"]),
+        ("''", ["validate", ""]),
+        ("--mesh", ["convert", capture, "-o", "a", "--mesh", ""]),
+        ("--rays", ["convert", capture, "-o", "a", "--rays="]),
+    ]:
+        status, line = refused(capsys, *arguments)
+        assert (status, f"usdbrdf: {subject}: the word given here is empty" in line) == (2, True)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.fault("R16")
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("NUMBA_DISABLE_JIT", "1"), ("NUMBA_NUM_THREADS", "0"), ("NUMBA_NUM_THREADS", "-2")],
+)
+def test_settings_of_the_compiler_that_nothing_works_with(
+    name, value, capture, tmp_path, capsys, monkeypatch
+):
+    """They were a defect, and a capture whose cameras look past the mesh."""
+    monkeypatch.setenv(name, value)
+    status, line = refused(capsys, "convert", capture, "-o", tmp_path / "out")
+    assert (status, name in line, "[environment.compiler]" in line) == (4, True, True)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.fault("R17")
 def test_paths_that_nobody_can_follow(capture, tmp_path, capsys):
     (tmp_path / "loop").symlink_to("loop")
     for arguments in (["convert", capture, "-o", tmp_path / "loop/out"], ["validate", "loop"]):

@@ -49,11 +49,13 @@ def _run(arguments: Sequence[str]) -> int:
         return 0
     with loading():
         from usdbrdf.files.paths import refuse_lost_folder
+        from usdbrdf.job.compiler import refuse_unusable_settings
         from usdbrdf.job.memory import refuse_few_addresses
     refuse_lost_folder()
     command = parsed(arguments, COMMANDS)
     set_quiet(getattr(command, "quiet", False))
     refuse_few_addresses()
+    refuse_unusable_settings()
     return command.run()
 
 

@@ -52,6 +52,7 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
     name, words = (arguments[0], list(arguments[1:])) if arguments else ("nothing", [])
     if name not in commands:
         raise UsageError(f"{name}: expected a command. See usdbrdf --help. [usage.command]")
+    _refuse_empty(words)
     said, given = _said(commands[name]), {}
     # Nothing that was or must be said needs a parser, which takes time to load.
     if words or any(item.field.default is REQUIRED for item in said):
@@ -68,6 +69,19 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
             raise UsageError(f"{sentence} See usdbrdf {name} --help. [usage.option]") from error
     command: Command = _made(commands[name], given)
     return command
+
+
+def _refuse_empty(words: Sequence[str]) -> None:
+    """UsageError for a word that says nothing, such as a variable of a shell that is not set, which
+    cyclopts takes for the default, and Python, as a path, for the current folder."""
+    for before, word in pairwise(["", *words]):
+        option, equals, value = word.partition("=") if word.startswith("-") else ("", "", word)
+        if not value and (equals or not option):
+            subject = option or (before if before.startswith("-") else "") or "''"
+            raise UsageError(
+                f"{subject}: the word given here is empty. Give a value, or leave it out. "
+                "[usage.option]"
+            )
 
 
 def completion(shell: str, commands: Commands) -> str:

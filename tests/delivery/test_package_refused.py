@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import resource
+
 import numpy as np
 import pytest
 from pxr import Sdf
@@ -120,3 +123,25 @@ def test_a_file_in_the_place_of_the_folder(room, tmp_path):
 def test_options_that_cannot_be(room, tmp_path, name, options):
     with pytest.raises(UsageError):
         packed(room, tmp_path, name, **options)
+
+
+@pytest.mark.fault("R1")
+def test_a_disk_that_takes_half_of_a_package_is_no_defect(tmp_path):
+    """USD's writer says that all is well, and opens what it wrote."""
+    (tmp_path / "room.usda").write_text(
+        '#usda 1.0\ndef "a" {\n    asset picture = @./a.png@\n    asset other = @./b.png@\n}\n'
+    )
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).write_bytes(os.urandom(50_000))
+    made = tmp_path / "out" / "room.usdz"
+    made.parent.mkdir()
+    for limit in (100, 1000, 40_000, 60_000, 100_000):
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
+        try:
+            with pytest.raises(EnvironmentFailure, match=r"Free disk space.*\[package.write\]"):
+                write_usdz(made, tmp_path, ["room.usda", "a.png", "b.png"])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert not list(made.parent.iterdir())
+    write_usdz(made, tmp_path, ["room.usda", "a.png", "b.png"])

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import resource
+
 import pytest
 
 from tests.fault_injection import run_fresh
 from usdbrdf.asset.layout import Asset
-from usdbrdf.errors import OwnershipConflict, UsageError
-from usdbrdf.evaluation.report import FILES, files_of, output_folder
+from usdbrdf.errors import EnvironmentFailure, OwnershipConflict, UsageError
+from usdbrdf.evaluation.report import (
+    FILES,
+    files_of,
+    output_folder,
+    write_document,
+    write_plot,
+    write_prose,
+    write_table,
+)
 from usdbrdf.files.documents import read_json, write_json
 
 DOCUMENT = "found.json"
+METRICS = ("l2", "l2_shown", "flip")
+ROWS = [{f"{metric}_{model}": 1 / 3 for metric in METRICS for model in ("baseline", "full")}] * 40
 
 
 def write(folder, *names):
@@ -98,3 +110,33 @@ print(number, mixed)
 def test_killed_at_any_change_the_next_run_knows_the_folder_and_nobody_reads_a_mixture(tmp_path):
     number, mixed = map(int, run_fresh(KILLED, tmp_path).split())
     assert number > mixed > 2
+
+
+@pytest.mark.fault("R1")
+@pytest.mark.parametrize(
+    ("name", "write_result"),
+    [
+        ("a.csv", lambda work: write_table(work / "a.csv", ROWS)),
+        ("a.md", lambda work: write_prose(work / "a.md", "x" * 10_000)),
+        ("a.png", lambda work: write_plot(work / "a.png", ROWS)),
+        ("a.svg", lambda work: write_plot(work / "a.svg", ROWS)),
+        (DOCUMENT, lambda work: write_document(work, DOCUMENT, {"rows": ROWS})),
+    ],
+)
+def test_a_disk_that_takes_no_results_is_said_and_leaves_what_was_there(
+    tmp_path, name, write_result
+):
+    write(tmp_path / "out", "a")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fail():
+        with output_folder(tmp_path / "out", DOCUMENT, ()) as work:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+            try:
+                write_result(work)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    with pytest.raises(EnvironmentFailure, match=rf"{name}: File too large.*\[environment.io\]"):
+        fail()
+    assert files_of(tmp_path) == ["out/a", f"out/{DOCUMENT}"]

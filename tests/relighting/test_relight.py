@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pxr import Sdf
 
 from tests.json_schemas import checked
 from tests.relighting.conftest import BASE
 from usdbrdf.cli import main
-from usdbrdf.errors import UsdBrdfError
+from usdbrdf.errors import OwnershipConflict, UsdBrdfError
 from usdbrdf.files.images import read_radiance
 from usdbrdf.options import RelightOptions
 from usdbrdf.relighting.relight import relight
@@ -345,3 +346,31 @@ def test_a_missing_renderer_names_the_extra(
 def test_the_renderer_is_imported_only_when_something_is_rendered() -> None:
     code = "import sys, usdbrdf.cli; sys.exit(any(m in sys.modules for m in ('mitsuba', 'drjit')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.fault("R10")
+@pytest.mark.parametrize("many", [False, True])
+def test_a_picture_never_takes_the_place_of_a_photograph(
+    room: Path, tmp_path: Path, many: bool
+) -> None:
+    """Nor that of what lights the scene, also by another way to its folder."""
+    photograph, sky = tmp_path / "scan" / "0000.exr", tmp_path / "scan" / "sky.exr"
+    photograph.parent.mkdir()
+    (tmp_path / "way").symlink_to("scan")
+    for file in (photograph, sky):
+        file.write_text("the only one")
+    where = Sdf.Layer.CreateNew(str(room / "layers" / "photographs.usdc"))
+    where.ImportFromString(
+        '#usda 1.0\nover "room" {\n over "eye" {\n'
+        "  asset image.timeSamples = { 1: @../../scan/0000.exr@ }\n }\n}\n"
+    )
+    where.Save()
+    options = RelightOptions(lights=sky, camera="/room/eye")
+    outputs = [tmp_path / "way" / file.name for file in (photograph, sky)]
+    if many:
+        options = replace(options, views=_views(tmp_path, "0000"), camera=None)
+        outputs = [tmp_path / "way"]
+    for output in outputs:
+        with pytest.raises(OwnershipConflict, match=r"photograph.*\[relight.output\]"):
+            relight(room, output, options)
+    assert {file.read_text() for file in (photograph, sky)} == {"the only one"}

@@ -12,6 +12,7 @@ from pxr import Sdf, Tf, UsdUtils
 
 from usdbrdf.asset.layout import LIGHTING, ROLES, Asset, relative_path
 from usdbrdf.asset.readers.compose import in_one_line, try_in_child
+from usdbrdf.asset.readers.tried import try_layers
 from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict
 from usdbrdf.files.atomic import make_folders, publish, temporary_beside
 
@@ -85,10 +86,11 @@ def _confine_to(lighting: str, layer: Sdf.Layer) -> None:
 
 def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, Path]) -> None:
     try:
+        try_layers([path])
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
         text = Sdf.Layer.CreateAnonymous(".usda")
         text.TransferContent(layer)
-    except (Tf.ErrorException, TypeError) as error:
+    except (Tf.ErrorException, TypeError, InputRefused) as error:
         raise OwnershipConflict(
             f"{path}: the layer was edited and USD cannot read it any more, so its edits cannot be "
             "adopted. Repair it, or give it up with --discard. [ownership.unreadable]"

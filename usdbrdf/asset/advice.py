@@ -21,6 +21,7 @@ from usdbrdf.asset.layers.author import attribute, define, export
 from usdbrdf.asset.layers.scan_layer import FAR_M, NEAR_M, lens_from_pinhole
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.readers.scene import LENS
+from usdbrdf.asset.readers.tried import try_layers
 from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
 from usdbrdf.model.camera import Camera
@@ -172,7 +173,8 @@ def read_advice(asset: Asset) -> tuple[list[dict[str, Any]], bool] | None:
     if not file.is_file():
         return None
     layer = None
-    with suppress(Tf.ErrorException):
+    with suppress(Tf.ErrorException, InputRefused):
+        try_layers([file])
         layer = Sdf.Layer.OpenAsAnonymous(str(file))
     found: list[tuple[int, dict[str, Any]]] = []
     if layer is not None:

@@ -19,6 +19,7 @@ from pxr import Ar, Sdf, Tf, UsdUtils
 
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.readers.compose import in_one_line, named_files, open_stage
+from usdbrdf.asset.readers.tried import try_layers
 from usdbrdf.delivery.packaged_files import ADDRESS
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 
@@ -70,6 +71,8 @@ def collected(asset: Asset, root: str, *, photographs: bool) -> Collection:
     beside = [canonical(file) for file in taken if file.is_file()]
     # Layers of ours may name what lies elsewhere; what only the artist's layers reach may not.
     own = [canonical(file) for file in ours if file.is_file()]
+    # Together, for a child takes a second; what else they lead to each in its turn.
+    try_layers([*own, *beside, *map(canonical, sorted(asset.folder.glob("objects/*/*.usd*")))])
     measured = _reached([*own, *beside], {top, edits})
     layers = _reached([top, *beside], set())
     found.places = {top: root, edits: "layers/edits.usda"}
@@ -170,6 +173,7 @@ def _reached(start: Sequence[Path], stop: set[Path]) -> dict[Path, Sdf.Layer]:
 
 
 def _copy_of(file: Path) -> Sdf.Layer:
+    try_layers([file])
     try:
         copy, why = Sdf.Layer.OpenAsAnonymous(str(file)), "it is not there"
     except Tf.ErrorException as error:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -437,7 +438,8 @@ def write_usdz(path: Path, folder: Path, members: Sequence[str]) -> None:
             for member in members:
                 os.utime(folder / member, (pinned, pinned))
                 writer.AddFile(str(folder / member), member)
-            stage, why = Usd.Stage.Open(str(staged)) if writer.Save() else None, ""
+            whole = writer.Save() and _is_whole(staged, members)
+            stage, why = Usd.Stage.Open(str(staged)) if whole else None, ""
         except Tf.ErrorException as error:
             stage, why = None, f" ({in_one_line(error)})"
         if stage is None:
@@ -456,3 +458,12 @@ def write_usdz(path: Path, folder: Path, members: Sequence[str]) -> None:
                 "usdbrdf; please report it. [package.composition]"
             )
         publish(staged, path)
+
+
+def _is_whole(package: Path, members: Sequence[str]) -> bool:
+    """Whether all that was packed can be read: USD's writer goes on where the disk is full."""
+    try:
+        with zipfile.ZipFile(package) as found:
+            return set(members) <= set(found.namelist()) and found.testzip() is None
+    except (zipfile.BadZipFile, OSError, EOFError):
+        return False

@@ -14,10 +14,16 @@ from usdbrdf.asset.maps import AssetMaps, camera_hits
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.evaluation.metrics import MIN_SAMPLES, MapError, map_error
-from usdbrdf.evaluation.report import FILES, Row, files_of, magma, output_folder, sheet, table_text
-from usdbrdf.files.atomic import write_text_atomic
+from usdbrdf.evaluation.report import (
+    FILES,
+    Row,
+    magma,
+    output_folder,
+    sheet,
+    write_document,
+    write_table,
+)
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
-from usdbrdf.files.documents import write_json
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.job.ownership import reads_asset
 from usdbrdf.job.progress import progress, warn
@@ -68,10 +74,9 @@ def compare(
     place_b, b = measured_atlas(Path(second), chosen.other_lighting)
     with output_folder(Path(output), DOCUMENT, (place_a, place_b)) as work:
         found, (forth, back) = agreement(a, b, (place_a.name, place_b.name))
-        write_text_atomic(work / "comparison.csv", table_text(found["objects"]))
+        write_table(work / "comparison.csv", found["objects"])
         _write_pictures(work / "pictures", forth, back, a.frames)
-        found[FILES] = [*files_of(work), DOCUMENT]
-        write_json(work / DOCUMENT, found)
+        write_document(work, DOCUMENT, found)
     return found
 
 

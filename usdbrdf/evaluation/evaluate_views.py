@@ -26,9 +26,7 @@ from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.asset.readers.views import Views, photographs_of_views
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation import metrics, report
-from usdbrdf.files.atomic import write_text_atomic
 from usdbrdf.files.colour import display_exposure, to_display_srgb
-from usdbrdf.files.documents import write_json
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.files.scratch import scratch_folder
@@ -84,7 +82,7 @@ def evaluate(
         exposure = exposure_of_views(photographs.frames)
         seen = viewed_asset(place, atlas, chosen.environment)
         rows = score_views(work / "pictures", seen, photographs, exposure, chosen)
-        write_text_atomic(work / "evaluation.csv", report.table_text(rows))
+        report.write_table(work / "evaluation.csv", rows)
         report.write_plot(work / "evaluation.png", rows)
         found = {
             "asset": place.name,
@@ -98,9 +96,8 @@ def evaluate(
             "summary": report.summary_of_views(rows),
             "frames": rows,
             **known,
-            report.FILES: [*report.files_of(work), DOCUMENT],
         }
-        write_json(work / DOCUMENT, found)
+        report.write_document(work, DOCUMENT, found)
     return found
 
 

@@ -22,6 +22,7 @@ from usdbrdf.files.atomic import (
     publish,
     temporary_beside,
     temporary_folder,
+    write_text_atomic,
 )
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.job.progress import say
@@ -155,6 +156,24 @@ def parts_of_sheet(whole: Float, rows: int, columns: int) -> list[Float]:
     return [whole[top : top + height, left : left + width] for top, left in corners]
 
 
+def write_prose(path: Path, text: str) -> None:
+    """A result. EnvironmentFailure where the disk does not take it."""
+    with environment_failures(str(path)):
+        write_text_atomic(path, text)
+
+
+def write_table(path: Path, rows: Sequence[Row]) -> None:
+    """The same rows for programs, as CSV."""
+    write_prose(path, table_text(rows))
+
+
+def write_document(work: Path, document: str, found: dict[str, Any]) -> None:
+    """What lists all that was written, last; adds the list to ``found``."""
+    found[FILES] = [*files_of(work), document]
+    with environment_failures(str(work / document)):
+        write_json(work / document, found)
+
+
 def write_plot(path: Path, rows: Sequence[Row]) -> None:
     """Panels of L2 and FLIP over the rows ``l2_baseline``, ``l2_full``, ... as PNG or SVG.
 
@@ -182,7 +201,11 @@ def write_plot(path: Path, rows: Sequence[Row]) -> None:
     axes.legend()
     # Equal rows give equal bytes.
     metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
-    with temporary_beside(path) as staged, rc_context({"svg.hashsalt": "usdbrdf"}):
+    with (
+        environment_failures(str(path)),
+        temporary_beside(path) as staged,
+        rc_context({"svg.hashsalt": "usdbrdf"}),
+    ):
         figure.savefig(staged, dpi=110, format=path.suffix[1:], metadata=metadata)
         publish(staged, path)
 

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as exceptions, which end a run where its work can be gone on with."""
+"""SIGINT, SIGTERM and SIGHUP as exceptions, which end a run where its work can be gone on with."""
 
 from __future__ import annotations
 
@@ -11,22 +11,24 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import NoReturn
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# The last comes where a terminal is closed, or a connection to it breaks; not under nohup.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Seconds until one that was swallowed comes again: by then whatever did so has returned.
 _AGAIN = 0.05
 
 
 class Terminated(BaseException):
-    """SIGTERM came. Not an Exception: nothing on the way may take it for a failure."""
+    """SIGTERM or SIGHUP came. Not an Exception: nothing on the way may take it for a failure."""
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """SIGINT raises KeyboardInterrupt and SIGTERM ``Terminated`` in here, as far as they are not
+    """SIGINT raises KeyboardInterrupt, the others ``Terminated`` in here, as far as they are not
     ignored; the handlers before are back afterwards.
 
     Compiled libraries call Python where they cannot pass an exception on: they print it and carry
-    on. One that ends there comes again."""
+    on. One that ends there comes again. Others fail because of it, with an error of their own:
+    what is raised is the exception that came."""
 
     def interrupt(number: int, _frame: object) -> NoReturn:
         raise KeyboardInterrupt if number == signal.SIGINT else Terminated
@@ -38,9 +40,25 @@ def interruptible() -> Iterator[None]:
     try:
         with _coming_again():
             yield
+    except Exception as error:
+        if (ending := _behind(error)) is not None:
+            raise ending from None
+        raise
     finally:
         for number, handler in replaced.items():
             signal.signal(number, handler)
+
+
+def _behind(error: BaseException) -> BaseException | None:
+    """The exception of ours that another was raised because of, or while it was handled."""
+    seen: list[BaseException] = []
+    behind: BaseException | None = error
+    while behind is not None and behind not in seen:
+        if isinstance(behind, (KeyboardInterrupt, Terminated)):
+            return behind
+        seen.append(behind)
+        behind = behind.__cause__ or behind.__context__
+    return None
 
 
 @contextmanager

@@ -19,8 +19,7 @@ from usdbrdf.evaluation.evaluate_views import (
     scored_views,
     viewed_asset,
 )
-from usdbrdf.files.atomic import write_text_atomic
-from usdbrdf.files.documents import write_json
+from usdbrdf.files.atomic import environment_failures
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
@@ -65,8 +64,9 @@ def write_paper(
         _Side(place=place_b.in_lighting(b.lighting or None), atlas=b, document=chosen.other_views),
     )
     with report.output_folder(Path(output), DOCUMENT, (place_a, place_b)) as work:
-        (work / "tables").mkdir()
-        (work / "figures").mkdir()
+        with environment_failures(str(work)):
+            (work / "tables").mkdir()
+            (work / "figures").mkdir()
         found, pair = agreement(a, b, (place_a.name, place_b.name))
         found["materials"] = tables.material_rows(a, b)
         _write_agreement(work, found, pair)
@@ -79,9 +79,8 @@ def write_paper(
             found["relighting"] = figures.write_relit(
                 work / "figures/fig10_relighting.png", places, camera, chosen
             )
-        write_text_atomic(work / "paper.md", paper_text(found, report.files_of(work)))
-        found[report.FILES] = [*report.files_of(work), DOCUMENT]
-        write_json(work / DOCUMENT, found)
+        report.write_prose(work / "paper.md", paper_text(found, report.files_of(work)))
+        report.write_document(work, DOCUMENT, found)
     return found
 
 
@@ -93,7 +92,7 @@ def _write_agreement(work: Path, found: dict[str, Any], pair: tuple[Relit, Relit
         "materials": found["materials"],
     }
     for name, own in rows.items():
-        write_text_atomic(work / f"tables/{name}.csv", report.table_text(own))
+        report.write_table(work / f"tables/{name}.csv", own)
     frames = pair[0].atlas.frames
     seen = figures.seen_by(pair, frames.at(spread_evenly(len(frames), _CAMERAS)))
     for name, sheet in (
@@ -114,7 +113,7 @@ def _score(work: Path, name: str, side: _Side, options: PaperOptions) -> dict[st
         for view in scored_views(found, views, exposure_of_views(views.frames), options.evaluate):
             rows.append(view.row)
             shown.see(view)
-    write_text_atomic(work / f"tables/views_{name}.csv", report.table_text(rows))
+    report.write_table(work / f"tables/views_{name}.csv", rows)
     for suffix in ("png", "svg"):
         report.write_plot(work / f"figures/fig8_{name}.{suffix}", rows)
     write_preview_png(work / f"figures/fig9_{name}.png", figures.views_sheet(shown.chosen()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.compose import open_edited
+from usdbrdf.asset.readers.compose import open_edited, recorded_photographs
 from usdbrdf.asset.readers.render_scene import (
     eye_height,
     render_scene_from_stage,
@@ -62,6 +63,7 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
         targets = [output / f"{Path(view.name).stem}.{options.format}" for view in views]
         for target in targets:
             _refuse_taken(target, folder=False)
+    _refuse_inputs(targets, asset, options)
     falls = any(insert.falls_from_eye_height for insert in options.inserts)
     scene = relit_scene(captured, options, eye_height(stage) if falls else 0.0)
     told = {
@@ -166,6 +168,20 @@ def _check(options: RelightOptions, output: Path, asset: Asset) -> None:
     for file in (lights, *(insert.model for insert in options.inserts)):
         if file is not None and not file.is_file():
             raise InputRefused(f"{file}: no such file. Check the path. [usage.file]")
+
+
+def _refuse_inputs(targets: Sequence[Path], asset: Asset, options: RelightOptions) -> None:
+    """OwnershipConflict where a picture would replace a photograph of the capture, or what it is
+    made from."""
+    given = [options.lights, *(insert.model for insert in options.inserts)]
+    inputs = {os.path.realpath(file) for file in given if file is not None}
+    inputs |= {os.path.realpath(photograph) for photograph in recorded_photographs(asset)}
+    for target in targets:
+        if os.path.realpath(target) in inputs:
+            raise OwnershipConflict(
+                f"{target}: this is a photograph of the capture, or another input, which stays as "
+                "it is. Name another place with -o. [relight.output]"
+            )
 
 
 def _refuse_options_of_pictures(options: RelightOptions) -> None:

@@ -10,12 +10,13 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-from pxr import Ar, Sdf, Usd
+from pxr import Ar, Sdf, Tf, Usd
 
 from usdbrdf.asset.manifest import changes
 from usdbrdf.asset.properties import SCHEMA_VERSION
 from usdbrdf.asset.readers.compose import named_files
 from usdbrdf.asset.readers.scene import asset_file
+from usdbrdf.asset.readers.tried import try_layers
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import read_exr
@@ -211,7 +212,15 @@ def missing_photograph(scene: AssetStage) -> Iterator[Fault]:
     file = scene.asset.photographs_layer if scene.asset else None
     if file is None or not file.is_file():
         return
-    layer = Sdf.Layer.FindOrOpen(str(file))
+    try:
+        try_layers([file])
+        layer = Sdf.Layer.FindOrOpen(str(file))
+    except (Tf.ErrorException, InputRefused):
+        layer = None
+    if layer is None:
+        problem = f"@{file}@ cannot be read. usdbrdf convert makes it anew."
+        yield Fault(scene.asset_root or scene.stage.GetRootLayer(), problem)
+        return
     named = sorted({located(layer, path) for path in named_files(layer)})
     if gone := [path for path in named if not _is_there(path)]:
         more = f" Nor do {len(gone) - 1} more of its photographs." if len(gone) > 1 else ""

@@ -17,6 +17,7 @@ from pxr import Ar, Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.properties import Fact, known_facts
 from usdbrdf.asset.readers.compose import in_one_line
+from usdbrdf.asset.readers.tried import wrote
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, sha256_of, temporary_beside
 
@@ -183,6 +184,7 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
                 "defect of usdbrdf; please report it. [stage.composition]"
             )
         os.replace(written, path)
+    wrote(path)
 
 
 def _refuse_damaged(asset: str) -> None:

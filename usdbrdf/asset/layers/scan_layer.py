@@ -90,6 +90,8 @@ def _no_edits(header: StageHeader) -> Sdf.Layer:
 
 def is_edited(asset: Asset) -> bool:
     """Whether an artist's edits.usda is another than the one that was written."""
+    if not asset.edits_layer.is_file():
+        return True  # and nothing that could be waited for is read
     try:
         empty = _no_edits(read_header(asset.layer("scan"))).ExportToString()
         return bool(asset.edits_layer.read_bytes() != empty.encode("utf-8"))

@@ -14,6 +14,7 @@ from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import LIGHTING, ROLES, Asset
 from usdbrdf.asset.manifest import refuse_converted
 from usdbrdf.asset.maps import AssetMaps
+from usdbrdf.asset.readers.tried import TIMEOUT_S, look_through, refuse_special, try_layers
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.job.child import run_child
@@ -24,7 +25,6 @@ from usdbrdf.options import NO_LIGHT, Surroundings
 from usdbrdf.untrusted.usd_paths import words_of
 
 _MAX_LENGTH = 600
-_TIMEOUT_S = 600.0
 
 
 def in_one_line(error: object) -> str:
@@ -54,10 +54,11 @@ def open_edited(asset: Asset) -> Usd.Stage:
     """The asset as everybody else opens it: the root layer, with the artist's opinions.
     InputRefused where it does not compose, or USD crashes on it."""
     refuse_converted(asset)
-    try_in_child(asset.root_layer)
+    beside = [file for file in [asset.photographs_layer] if file.is_file()]
+    try_in_child(asset.root_layer, beside=beside)
     stage = open_stage(asset.root_layer)
-    if asset.photographs_layer.is_file():
-        stage.GetSessionLayer().subLayerPaths.append(str(asset.photographs_layer))
+    for file in beside:
+        stage.GetSessionLayer().subLayerPaths.append(str(file))
     return _in_lighting(stage, asset)
 
 
@@ -111,17 +112,20 @@ def warn_of_edits(asset: Asset) -> None:
         say(f"warning: {problem} The layers in layers/ are measured all the same.")
 
 
-def try_in_child(layer: Path, *, composes: bool = True) -> None:
+def try_in_child(layer: Path, *, composes: bool = True, beside: Sequence[Path] = ()) -> None:
     """Open a stage that an artist may have edited in a child process, to learn whether USD survives
-    it: prims nested 100,000 deep make it crash. InputRefused where it does not.
+    it: prims nested 100,000 deep make it crash. InputRefused where it does not, and for what lies
+    among an asset's layers and is no regular file, which USD would wait for.
 
     composes  refuse what ``open_stage`` refuses, too
+    beside    layers that the stage does not name, opened alone
     """
+    refuse_special(layer.parent)
     run_child(
-        "usdbrdf.asset.readers.compose:open_in_child",
+        f"{__name__}:open_in_child",
         {},
-        {"layer": str(layer), "composes": composes},
-        _TIMEOUT_S,
+        {"layer": str(layer), "composes": composes, "beside": [*map(str, beside)]},
+        TIMEOUT_S,
         f"{layer}: opening it with the layers that it names, edits.usda included,",
     )
 
@@ -133,6 +137,8 @@ def open_in_child(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -
     else:
         with suppress(Tf.ErrorException):
             Usd.Stage.Open(parameters["layer"])
+    for file in parameters["beside"]:
+        look_through(file)
     return {}
 
 
@@ -175,6 +181,14 @@ def named_files(layer: Sdf.Layer) -> set[str]:
     return found - {""}
 
 
+def recorded_photographs(asset: Asset) -> list[Path]:
+    """Where the photographs and masks of an asset lie, that has been opened; none are read."""
+    layer = asset.photographs_layer
+    if not layer.is_file():
+        return []
+    return [layer.parent / name for name in sorted(named_files(Sdf.Layer.FindOrOpen(str(layer))))]
+
+
 def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
     for layer in layers:
         if not layer.is_file():
@@ -186,8 +200,9 @@ def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
     root = new_layer(read_header(layers[0]), Provenance(role="view", version="1"))
     # Texture coordinates are a sublayer of texturing.usda already.
     uv = None if asset.lighting else asset.uv_layer
-    below = [str(layer) for layer in _beneath(asset)]
-    root.subLayerPaths = [*(str(layer) for layer in reversed(layers) if layer != uv), *below]
+    named = [*(layer for layer in reversed(layers) if layer != uv), *_beneath(asset)]
+    try_layers(named, together=True)
+    root.subLayerPaths = [*map(str, named)]
     return open_stage(root)
 
 

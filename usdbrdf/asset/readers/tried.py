@@ -1,0 +1,99 @@
+"""An asset may come from strangers, and there are layers that USD crashes on: a child process opens
+them first, but for those that this process has had tried or wrote itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from pxr import Sdf, Tf, Usd, UsdUtils
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.job.child import run_child
+from usdbrdf.model.arrays import Array
+
+TIMEOUT_S = 600.0
+_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+
+# Of files, as they are, what tells them from others: those that USD has opened alone, and together
+# with others as one stage.
+_State = tuple[int, int, int, int]
+_alone: set[_State] = set()
+_together: set[_State] = set()
+
+
+def try_layers(files: Sequence[Path], *, together: bool = False) -> None:
+    """InputRefused where USD crashes on one of these layers, or one is no regular file; whether it
+    can be opened is for whoever opens it to say.
+
+    together  compose a stage of them, the strongest first, rather than look at each alone
+    """
+    _refuse_special(files)
+    there = [file for file in files if file.is_file()]
+    known = _together if together else _alone
+    states = [_state(file) for file in there]
+    if known.issuperset(states):
+        return
+    # All of a stage; alone, those that are new.
+    asked = [f for f, state in zip(there, states, strict=True) if together or state not in known]
+    names = f"{asked[0]} and {len(asked) - 1} layers beside it" if len(asked) > 1 else f"{asked[0]}"
+    run_child(
+        f"{__name__}:look_in_child",
+        {},
+        {"layers": [*map(str, asked)], "together": together},
+        TIMEOUT_S,
+        f"{names}: opening them as USD" if len(asked) > 1 else f"{names}: opening it as USD",
+    )
+    known.update(states)
+    _alone.update(states)
+
+
+def look_in_child(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
+    """The child's part of ``try_layers``."""
+    if parameters["together"]:
+        root = Sdf.Layer.CreateAnonymous(".usda")
+        root.subLayerPaths = parameters["layers"]
+        with suppress(Tf.ErrorException):
+            Usd.Stage.Open(root)
+    for file in parameters["layers"]:
+        look_through(file)
+    return {}
+
+
+def wrote(file: Path) -> None:
+    """A layer that this process has just written: it need not be tried."""
+    state = _state(file)
+    _alone.add(state)
+    _together.add(state)
+
+
+def look_through(file: str) -> None:
+    """Open a layer alone and ask for all paths in it."""
+    with suppress(Tf.ErrorException):
+        if layer := Sdf.Layer.OpenAsAnonymous(file):
+            UsdUtils.ModifyAssetPaths(layer, lambda path: path)
+
+
+def refuse_special(folder: Path) -> None:
+    """InputRefused where something lies among the layers of an asset that USD would wait for."""
+    places = folder, folder / "layers", *folder.glob("objects/*")
+    for place in (place for place in places if place.is_dir()):
+        _refuse_special([file for file in place.iterdir() if file.suffix in _ENDINGS])
+
+
+def _refuse_special(files: Sequence[Path]) -> None:
+    for file in files:
+        # Of folders USD says it itself; an artist's may be called like that.
+        if file.exists() and not file.is_file() and not file.is_dir():
+            raise InputRefused(
+                f"{file}: this is no regular file, and a layer is to be here. Put the layer there, "
+                "from a copy of the asset, or remove it. [stage.file]"
+            )
+
+
+def _state(file: Path) -> _State:
+    """A file keeps it when it is renamed, and has another when it was replaced or changed."""
+    found = file.stat()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
