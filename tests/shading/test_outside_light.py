@@ -32,7 +32,7 @@ def _walls(alone: bool) -> tuple[Asked, Sources, Solution]:
         share=share,
         mean=np.zeros((2, 3)),
         deviation=np.array([3.0, 3.0]),
-        bound=np.zeros(2, np.bool_),
+        family=np.zeros(2, np.int64),
         pairs=np.zeros((0, 2), np.int64),
         apart=np.zeros(0),
     )

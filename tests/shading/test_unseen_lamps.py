@@ -236,7 +236,7 @@ def test_dark_surfaces_that_mirror_their_surroundings_do_not_dim_a_lamp():
             share=share[None],
             mean=np.zeros((1, 3)),
             deviation=np.array([3.0]),
-            bound=np.zeros(1, np.bool_),
+            family=np.zeros(1, np.int64),
             pairs=np.zeros((0, 2), np.int64),
             apart=np.zeros(0),
         )

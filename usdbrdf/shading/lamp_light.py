@@ -37,9 +37,12 @@ ROUGHLY = Sampling(standard_error=0, max_rays=32)
 # may differ.
 _AROUND = 2
 _UNEVEN, _OF_OTHER_LIGHT = calibration.pair("unseen.uneven")
+# Among the sources of one scan, beside the sky's patches and the sun, which are 0.
+_LAMP = 1
 _LEAST_EVEN = calibration.number("unseen.least_even")
 _BRIGHTER = calibration.number("unseen.brighter")
 LEAST_PART = calibration.number("unseen.least_part")
+MOST_OF_CERTAIN = calibration.number("unseen.most_beside")
 
 
 class Lamps(NamedTuple):
@@ -108,7 +111,7 @@ def sources_of(lamps: Lamps, share: Double) -> Sources:
         share=share,
         mean=lamps.mean,
         deviation=lamps.deviation,
-        bound=np.zeros(len(share), np.bool_),
+        family=np.full(len(share), _LAMP, np.int64),
         pairs=np.zeros((0, 2), np.int64),
         apart=np.zeros(0),
     )

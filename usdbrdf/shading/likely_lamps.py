@@ -8,6 +8,7 @@ if it is bright. The likeliest are chosen one after the other, each beside those
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -85,7 +86,8 @@ def strongest(groups: ClippedGroups) -> Long:
     return np.flatnonzero(groups.lamp)[:_CLIPPED]
 
 
-class Beside(NamedTuple):
+@dataclass(frozen=True)
+class Beside:
     """What may light a scan beside daylight: ``likely``, of those ``groups`` that clip; and of
     objects whether they are lamps, where that is ``said``."""
 
@@ -93,7 +95,9 @@ class Beside(NamedTuple):
     groups: ClippedGroups
     said: Mapping[int, bool]
 
-    def __len__(self) -> int:
+    @property
+    def count(self) -> int:
+        """Of the objects and of the parts that clip."""
         return len(self.likely.object) + len(self.likely.clipped)
 
     def lamps(self, texels: Texels) -> Lamps:
@@ -102,7 +106,7 @@ class Beside(NamedTuple):
 
     def of(self, shines: Bool) -> Beside:
         """With those of the objects that do."""
-        return self._replace(likely=self.likely.of(np.flatnonzero(shines)))
+        return replace(self, likely=self.likely.of(np.flatnonzero(shines)))
 
 
 def beside_daylight(
@@ -119,9 +123,6 @@ def beside_daylight(
     groups = clipped_groups(surface.texels, lit, coverage, said)
     unseen = unseen_objects(surface.texels, coverage, said)
     asked = asked.of(~groups.texels_of(groups.lamp)[asked.texel])
-    if not (len(unseen) or groups.lamp.any()) or not len(asked.texel):
-        none = np.zeros(0, np.int64)
-        return Beside(Likely(none, np.zeros((0, 3)), none), groups, said)
     return Beside(
         likely_lamps(surface, lit, environment, asked, unseen, groups, said, seed), groups, said
     )
@@ -140,6 +141,8 @@ def likely_lamps(
     """Of the objects ``unseen`` (N,) and the lamps that clip those that explain most if they
     shine."""
     every = Likely(unseen, np.zeros((len(unseen), 3)), strongest(groups))
+    if not len(asked.texel) or not len(every.object) + len(every.clipped):
+        return Likely(unseen[:0], every.usual[:0], every.clipped[:0])
     lamps = every.as_lamps(surface.texels, groups, said)
     segments = np.arange(int(asked.segment.max()) + 1)
     each = np.arange(len(asked.texel))

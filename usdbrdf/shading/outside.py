@@ -32,7 +32,15 @@ from usdbrdf.shading.asked import (
 )
 from usdbrdf.shading.gloss import Mirrored, mirroring
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
-from usdbrdf.shading.lamp_light import Lamps, beside_others, brought, shining, sources_of, without
+from usdbrdf.shading.lamp_light import (
+    MOST_OF_CERTAIN,
+    Lamps,
+    beside_others,
+    brought,
+    shining,
+    sources_of,
+    without,
+)
 from usdbrdf.shading.likely_lamps import beside_daylight
 from usdbrdf.shading.outside_light import Asked, Solution, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sky_patches import (
@@ -62,7 +70,6 @@ _HIDDEN_BY_NIGHT = calibration.number("outside.hidden_by_night")
 # Of a sky that no frame shows: through a slit it is believed in only if that much is known of it.
 _SLIT = calibration.number("outside.slit")
 _MOST_SKY_ERROR = calibration.number("outside.most_sky_error")
-_MOST_OF_LAMP = calibration.number("unseen.most_beside")
 _DARK = 1e-4  # of what is reflected: less than that is no light to compare with
 
 
@@ -247,10 +254,13 @@ class _Look(NamedTuple):
         return shares_of_sky(self.surface, asked, unseen, self.z_up, self.seed, rays)
 
     def at(self, asked: Asked, share: Double) -> tuple[Asked, Sources]:
-        """The texels asked with S, W/m^2, of all that frames measured, and the other sources: those
-        of the patches, of which all bring ``share`` (P, N), and the lamps."""
+        """The texels asked, but the lamps', with S, W/m^2, of all that frames measured, and the
+        other sources: those of the patches, of which all bring ``share`` (P, N), and the lamps."""
         surface, environment = self.surface, _of_measured(self.seen, self.z_up)
-        lit = self.lit if self.lamps is None else without(self.lit, self.lamps)
+        lit = self.lit
+        if self.lamps is not None:
+            plain = self.lamps.of[asked.texel] < 0
+            lit, asked, share = without(lit, self.lamps), asked.of(plain), share[:, plain]
         lights = Shining.of(surface, lit, environment)
         irradiance = irradiance_of_texels(surface, lights, environment, asked.texel, self.seed)
         least = _DARK * np.median(asked.reflected)
@@ -263,7 +273,7 @@ class _Look(NamedTuple):
             share=np.concatenate([sky.share, lamps.share]),
             mean=np.concatenate([sky.mean, lamps.mean]),
             deviation=np.append(sky.deviation, lamps.deviation),
-            bound=np.append(sky.bound, lamps.bound),
+            family=np.append(sky.family, lamps.family),
         )
 
     def picture(self, radiance: Double) -> Environment:
@@ -304,7 +314,7 @@ def _with_lamps(
     beside = beside_daylight(
         look.surface, look.lit, look.coverage, look.under_sun(told), told.asked, look.seed, said
     )
-    while len(beside):
+    while beside.count:
         lamps = beside.lamps(look.surface.texels)
         look = look._replace(lamps=lamps)
         told = _told(look, asked, share)
@@ -312,7 +322,9 @@ def _with_lamps(
         near, part = beside_others(*told.with_sun, told.found)
         shines = shining(np.exp(told.found.log_radiance), near, part)[of_objects]
         if shines.any():
-            shines &= jackknife(*told.with_sun, told.found)[of_objects].max(axis=1) < _MOST_OF_LAMP
+            shines &= (
+                jackknife(*told.with_sun, told.found)[of_objects].max(axis=1) < MOST_OF_CERTAIN
+            )
         shines |= lamps.certain[: len(shines)]
         if shines.all():
             return look, beside.likely.object, told
@@ -324,6 +336,7 @@ def _with_lamps(
 
 
 def _told(look: _Look, asked: Asked, share: Double) -> _Told:
+    """Where the sun stands, and the strengths of all."""
     # Patches that had to stand for the sun brighten what it shines on: once it is found, its place
     # is looked for again.
     asked, sources = look.at(asked, share)
@@ -336,6 +349,7 @@ def _told(look: _Look, asked: Asked, share: Double) -> _Told:
 
 
 def _solved(look: _Look, asked: Asked, sources: Sources, sun: Sun) -> _Told:
+    """The strengths that explain best what the texels asked reflect, with the ``sun`` there."""
     with_sun = _with_sun(look.surface, asked, sources, sun, look.seed)
     return _Told(asked, sources, sun, with_sun, solved(*with_sun))
 
@@ -360,7 +374,7 @@ def _sun_shines(told: _Told, error: Double) -> bool:
 
 
 def _sunless(look: _Look, told: _Told) -> tuple[_Told, Double]:
-    """The same without the sun, and the errors."""
+    """The same without the sun, and the errors of its sources, (K, 3)."""
     asked = told.asked
     if look.mirrored is not None:
         sky = look.picture(np.exp(told.found.log_radiance))
@@ -372,8 +386,8 @@ def _sunless(look: _Look, told: _Told) -> tuple[_Told, Double]:
 
 
 def _clear_of_shadows(look: _Look, told: _Told, error: Double) -> tuple[_Told, Double]:
-    """The same by texels that lie clear of shadows' edges, and the errors, if these tell the sun
-    well."""
+    """The same by texels that lie clear of shadows' edges, and the errors, (K, 3), if these tell
+    the sun well."""
     many = asked_texels(look.surface.texels, look.lit, look.coverage, look.seed, _MANY_PER_SEGMENT)
     assert many is not None
     clear = _clearly_lit(look.surface, many, told.sun, look.seed)
@@ -436,7 +450,7 @@ def _with_sun(
         share=np.concatenate([sky.share, share[None]])[:, kept],
         mean=np.concatenate([sky.mean, strength[None]]),
         deviation=np.append(sky.deviation, _SUN_DEVIATION),
-        bound=np.append(sky.bound, False),
+        family=np.append(sky.family, 0),
         pairs=sky.pairs,
         apart=sky.apart,
         gloss=sky.gloss,

@@ -48,15 +48,16 @@ class Asked(NamedTuple):
 
 class Sources(NamedTuple):
     """K sources of unknown strength: what each brings per unit of it to the texels asked, (K, N);
-    the logarithm of its strength before the evidence, mean (K, 3) and deviation (K,); whether the
-    mean is a lower bound, (K,); and pairs of neighbours, which are alike, (P, 2), by how much
-    these are apart, (P,); and the gloss of segments, the share that they mirror of what usual
-    dielectrics would: mean and standard deviation."""
+    the logarithm of its strength before the evidence, mean (K, 3) and deviation (K,); its family,
+    (K,), those of one are as far from that together as one of them may be, -1 for one that errs by
+    itself; and pairs of neighbours, which are alike, (P, 2), by how much these are apart, (P,); and
+    the gloss of segments, the share that they mirror of what usual dielectrics would: mean and
+    standard deviation."""
 
     share: Double
     mean: Double
     deviation: Double
-    bound: Bool
+    family: Long
     pairs: Long
     apart: Double
     gloss: tuple[float, float] = (0.0, 0.0)
@@ -218,8 +219,8 @@ def _add_priors(
     k, last = len(g), len(gradient) - 1
     index = np.arange(k)
     off = sources.mean[:, channel] - g
-    # Together they are as far from what is usual as one of them may be: their errors agree.
-    precision = sources.deviation**-2.0 / np.where(sources.bound, 1, max((~sources.bound).sum(), 1))
+    size = np.bincount(sources.family + 1)[sources.family + 1]
+    precision = sources.deviation**-2.0 / np.where(sources.family < 0, 1, size)
     curvature[index, index] += precision
     gradient[:k] += precision * off
     pull = sources.apart**-2.0

@@ -87,7 +87,7 @@ def sources_in_sky(
     below = centre[:, 2 if z_up else 1] < 0
     apart = np.where(below[near[:, 0]] == below[near[:, 1]], _ALIKE, _ALIKE_OVER_HORIZON)
     deviation = np.where(bound, _ABOVE_LIMIT[1], _SKY_DEVIATION)
-    return Sources(share[used], mean, deviation, bound, near, apart)
+    return Sources(share[used], mean, deviation, -bound.astype(np.int64), near, apart)
 
 
 def picture_of_sky(

@@ -25,6 +25,7 @@ from usdbrdf.shading.asked import asked_texels
 from usdbrdf.shading.clipped_light import clipped_groups
 from usdbrdf.shading.lamp_light import (
     LEAST_PART,
+    MOST_OF_CERTAIN,
     ROUGHLY,
     beside_lamps,
     brought,
@@ -134,11 +135,12 @@ def lamps_that_explain(
             surface, lit, environment, frames, asked, lamps, strength, seed
         )
         own = slice(len(likely.object))
-        lamp = shining(found, near, part)[own]
+        certain = lamps.certain[own]
+        lamp = shining(found, near, part)[own] | certain
         if lamp.all():  # none of the others blurs what these are any more
             brightness = np.log(np.pi * found.mean(axis=1) / near)[own]
             lamp = (brightness > 2 * error[own]) & (error[own] < _MOST_ERROR)
-        lamp |= lamps.certain[own]
+            lamp |= certain & (error[own] < MOST_OF_CERTAIN)
         if lamp.all():
             order = np.argsort(likely.object)
             return UnseenLamps(
