@@ -168,16 +168,31 @@ def test_what_surfaces_mirror_is_not_taken_for_light_in_their_shadows(sunny):
     assert np.abs(asked_about[1].sun.irradiance - asked_about[0].sun.irradiance).max() > 0
 
 
-@pytest.mark.parametrize("panel", [15.0, 0.0])
-def test_a_lamp_that_no_frame_shows_is_told_from_the_sky_beside_it(panel: float):
-    surface, lit, _ = _lit(_yard(HUNG), Environment(SKY / 4, True), texture=0.1, panel=panel)
+@pytest.fixture(scope="module")
+def evening():
+    """The yard with a panel and two boards hung over it, in a weak sky without sun; the panel
+    shines or does not."""
+    found = {}
+    for panel in (15.0, 0.0):
+        world = _yard(HUNG)
+        found[panel] = _lit(world, Environment(SKY / 4, True), texture=0.1, panel=panel)[:2]
+    return found
+
+
+def _without_hung(surface: TexturedScene, lit):
+    """What frames show of ``lit``: not what hangs there; and some of the sky."""
     hung = surface.texels.object_index() >= PANEL
     shown = np.where(hung[:, None], np.median(lit[~hung], axis=0), lit).astype(np.float32)
+    north = directions_of_pixels(HEIGHT, WIDTH, True)[..., 1] > 0.5
+    seen = _seen(north & (_UP > 0) & (_UP < 0.5))
     coverage = CoverageMap.of(~hung, 0 * hung > 0)
-    seen = _seen(
-        (directions_of_pixels(HEIGHT, WIDTH, True)[..., 1] > 0.5) & (_UP > 0) & (_UP < 0.5)
-    )
-    seen = replace(seen, radiance=seen.radiance / 4)
+    return shown, coverage, replace(seen, radiance=seen.radiance / 4)
+
+
+@pytest.mark.parametrize("panel", [15.0, 0.0])
+def test_a_lamp_that_no_frame_shows_is_told_from_the_sky_beside_it(evening, panel: float):
+    surface, lit = evening[panel]
+    shown, coverage, seen = _without_hung(surface, lit)
     found = light_from_outside(surface, shown, coverage, seen, True, 0)
     assert found is not None
     assert found.lamps.tolist() == [PANEL] * (panel > 0)
@@ -188,6 +203,15 @@ def test_a_lamp_that_no_frame_shows_is_told_from_the_sky_beside_it(panel: float)
     )
     assert lamps.object.tolist() == found.lamps.tolist()
     np.testing.assert_allclose(lamps.radiance, panel, rtol=0.25)
+
+
+def test_a_lamp_beside_daylight_of_which_hardly_the_order_is_known_is_none(evening, monkeypatch):
+    surface, lit = evening[15.0]
+    given = surface, *_without_hung(surface, lit), True, 0
+    monkeypatch.setattr("usdbrdf.shading.outside.MOST_OF_CERTAIN", 0.0)
+    found = light_from_outside(*given)
+    assert found is not None
+    assert not len(found.lamps)
 
 
 def test_no_sun_is_found_where_none_shines(yard):

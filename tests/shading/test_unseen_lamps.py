@@ -197,6 +197,15 @@ def test_what_a_person_says_of_an_object_holds(hall):
         assert groups.lamp.tolist() == [shines]
 
 
+def test_what_a_person_says_of_one_says_nothing_of_another(hall, monkeypatch):
+    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
+    monkeypatch.setattr("usdbrdf.shading.unseen_lamps._MOST_ERROR", 0.0)
+    found = lamps_that_explain(surface, lit, coverage, FRAMES, DARK, 0, {SHELF: True})
+    assert LAMP not in found.object
+    # What hardly anything is known of is no lamp all the same.
+    assert (found.error < 1).all()
+
+
 def test_what_only_reflects_is_none(hall):
     # The lamp is a wall that frames show.
     surface, lit, coverage = _photographed(hall, RADIANCE / 4, 1)
