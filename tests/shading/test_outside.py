@@ -10,7 +10,7 @@ import pytest
 from tests.physics.surfaces import Sampling, box, quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.model.texels import CoverageMap
-from usdbrdf.shading import outside
+from usdbrdf.shading import sky_patches
 from usdbrdf.shading.outside import Outside, light_from_outside
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings
 from usdbrdf.shading.unseen_lamps import lamps_that_explain
@@ -366,7 +366,7 @@ def test_the_ground_beyond_may_be_darker_than_the_sky_over_it(yard, monkeypatch)
         return float(ground / sky)
 
     found = of_sky()
-    monkeypatch.setattr(outside, "_ALIKE_OVER_HORIZON", outside._ALIKE)
+    monkeypatch.setattr(sky_patches, "_ALIKE_OVER_HORIZON", sky_patches._ALIKE)
     assert found < 0.25
     assert found < 0.5 * of_sky()
 
