@@ -434,6 +434,13 @@ def test_folders_as_those_have_them_who_train_splats(splats, gone, taken, bends)
         np.testing.assert_allclose(scan.frames.intrinsics[0], expected)
 
 
+def test_images_of_full_size_are_taken_although_one_is_missing(splats):
+    (splats.folder / "images/0004.exr").unlink()
+    scan = read_scan(splats.folder, OPTIONS)
+    assert (len(scan.frames), _taken(scan)) == (9, {"images"})
+    assert any("1 of 10 frames dropped, '0004.exr'" in said for said in scan.warnings)
+
+
 def test_the_only_folder_that_holds_the_images_is_theirs(splats):
     for name in ("images_2", "images_4", "input", "distorted"):
         shutil.rmtree(splats.folder / name)

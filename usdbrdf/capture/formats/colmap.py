@@ -18,6 +18,7 @@ distorted model with undistorted images would bend them a second time.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -45,6 +46,8 @@ DESCRIPTION = DESCRIPTIONS[NAME]
 _WORKSPACES = ("", "dense", "dense/0", "undistorted", "colmap", "distorted")
 _MODELS = ("", "sparse/0", "sparse")
 _IMAGES = ("images", "input", "", "images_2", "images_4", "images_8")
+# What scaled-down copies of images are in.
+_REDUCED = re.compile(r"(^|/)images_\d+$")
 # How deep in the capture other folders of images are looked for.
 _BELOW = ("*/", "*/*/")
 # The last two are what COLMAP's own meshers write; fused.ply is a point cloud.
@@ -177,11 +180,13 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
         if not model.names:
             continue
         named += 1
-        counts = [
-            sum(pictured.of(name, f) is not None for name in model.names) for f in workspace.images
-        ]
-        if max(counts):
-            images = workspace.images[counts.index(max(counts))]
+        counts = {
+            folder: sum(pictured.of(name, folder) is not None for name in model.names)
+            for folder in workspace.images
+        }
+        counts = _of_full_size(counts)
+        if counts:
+            images = max(counts, key=counts.__getitem__)
             candidates.append(_Chosen(model, workspace.model, images))
         first = first or model.names[0]
     if not candidates and options.frames is None:
@@ -211,6 +216,14 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
             f"{len(largest.model.names)}. [colmap.model]"
         )
     return largest
+
+
+def _of_full_size(counts: dict[str, int]) -> dict[str, int]:
+    """Of folders and how many of the images they hold those that hold any: of images_2 and the like
+    only where no other does, however many these lack."""
+    counts = {folder: count for folder, count in counts.items() if count}
+    full = {folder: count for folder, count in counts.items() if not _REDUCED.search(folder)}
+    return full or counts
 
 
 def _elsewhere(path: Path, workspaces: Sequence[_Workspace], findings: Findings) -> list[_Chosen]:
