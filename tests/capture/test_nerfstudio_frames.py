@@ -136,6 +136,18 @@ def test_the_points_that_nerfstudio_begins_from_are_no_mesh(capture):
         read_scan(capture.folder, IngestOptions())
 
 
+def test_points_are_known_by_their_header_whatever_they_are_called(capture):
+    """OpenMVS and COLMAP's users call meshes fused.ply too."""
+    (capture.folder / "mesh.ply").rename(capture.folder / "fused.ply")
+    cloud = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+    cloud += b"property float z\nelement face 0\nproperty list uchar int vertex_indices\n"
+    (capture.folder / "room.ply").write_bytes(cloud + b"end_header\n0 0 0\n")
+    assert len(read_scan(capture.folder, IngestOptions()).mesh.points) == len(capture.points)
+    (capture.folder / "fused.ply").unlink()
+    with pytest.raises(InputRefused, match=r"no mesh \(room\.ply holds points alone\)\. Put"):
+        read_scan(capture.folder, IngestOptions())
+
+
 def test_the_only_mesh_beside_the_poses_is_theirs(capture):
     (capture.folder / "mesh.ply").rename(capture.folder / "room.ply")
     assert len(read_scan(capture.folder, IngestOptions()).mesh.points) == len(capture.points)
