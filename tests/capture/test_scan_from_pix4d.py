@@ -15,7 +15,7 @@ from tests.format_truth import (
     write_image,
     write_obj,
 )
-from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
 from usdbrdf.capture.reconstructions.pix4d import shots_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
@@ -61,6 +61,19 @@ def test_a_project_is_the_room(tmp_path):
     scan = read_scan(tmp_path, OPTIONS)
     assert_same(scan, room, names=room.names)
     assert scan.adapter == "pix4d"
+
+
+@pytest.mark.parametrize("named", [PARAMETERS, "1_initial/params"])
+def test_the_project_is_found_above_its_parameters(tmp_path, named):
+    room = truth()
+    _write(tmp_path, room, _document(room))
+    scan = read_scan(tmp_path / named, OPTIONS)
+    assert_same(scan, room)
+    assert scan.name == tmp_path.name
+    beside = files_beside(choose_adapter(tmp_path / named), tmp_path / named, None)
+    mesh = tmp_path / "2_densification/3d_mesh/room_simplified_3d_mesh.obj"
+    assert beside == sorted([*scan.frames.image_paths, mesh])
+    assert files_beside(choose_adapter(tmp_path), tmp_path, None) == []
 
 
 def test_the_parameters_may_lie_beside_the_pictures(tmp_path):
