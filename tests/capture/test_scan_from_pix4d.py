@@ -150,3 +150,12 @@ def test_numbers_are_those_of_the_head_of_a_file(tmp_path):
     local = (world[:3, :3].T @ (point - world[:3, 3])) * (1, -1, -1)
     pixel = shot.camera.lens.project(local, shot.camera.intrinsics)
     np.testing.assert_allclose(pixel, seen[:2] / seen[2], atol=1e-9)
+
+
+def test_of_several_files_one_is_to_be_named(tmp_path):
+    for name in ("a.txt", "b.txt"):
+        (tmp_path / name).write_text(HEAD)
+    with pytest.raises(
+        InputRefused, match=r": 2 files calibrated_camera_parameters.*\. Name the one"
+    ):
+        read_scan(tmp_path, OPTIONS)

@@ -118,12 +118,17 @@ def shots_of(source: Path, names: tuple[str, ...] | None) -> list[Shot]:
     """The photographs of a document, by their numbers where they have no names."""
     head = number_rows(source, most=1)
     count = int(head[0][0]) if head and len(head[0]) == 2 and 0 <= head[0][0] < _LARGEST else -1
-    rows = number_rows(source, most=1 + _ROWS * count)[1:] if count >= 0 else ()
+    if count < 0:
+        raise InputRefused(
+            f"{source}: no line at its beginning says how many cameras and points follow. It was "
+            "cut off, or is of another format; export it again. [capture.format]"
+        )
+    rows = number_rows(source, most=1 + _ROWS * count)[1:]
     numbers = np.concatenate(rows) if rows else np.zeros(0)
-    if count < 0 or len(numbers) != _COUNTS * count:
+    if len(numbers) != _COUNTS * count:
         raise InputRefused(
             f"{source}: {len(rows) // _ROWS} cameras of {_COUNTS} numbers where it announces "
-            f"{max(count, 0)}. It was cut off, or is of another format; export it again. "
+            f"{count}. It was cut off, or is of another format; export it again. "
             "[capture.format]"
         )
     if names is None:

@@ -55,7 +55,7 @@ def _documents(path: Path) -> list[Path]:
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
     if len(documents) != 1:
-        said = f"{len(documents)} of them" if documents else "no calibrated_camera_parameters.txt"
+        said = f"{len(documents) or 'no'} files calibrated_camera_parameters.txt"
         raise InputRefused(
             f"{path}: {said}. Name the one in {_PLACE} of the project. [capture.format]"
         )
