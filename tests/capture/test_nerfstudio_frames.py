@@ -4,6 +4,7 @@ dataparser does (nerfstudio_dataparser.py, auto_orient_and_center_poses)."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,17 +91,26 @@ def test_an_exported_mesh_alone_says_what_is_missing(capture):
 
 
 def test_areas_are_those_of_the_capture(capture):
-    """Parts of less than a square metre; the training's metre is larger."""
-    document = json.loads((capture.folder / "objects.json").read_text())
+    """A part that is large enough, and would be too small in the training's metres, which are
+    larger."""
     (capture.folder / "objects.json").unlink()
-    mesh = _train(capture, name="mesh.ply")
-    points = read_scan(capture.folder, IngestOptions()).mesh.points
-    assert len(document["objects"]) > 1
-    options = IngestOptions(objects=None, min_component_area_m2=1.0)
+    area, least, square = 1.1, 1.05, np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    added = np.array([[0, 1, 2], [0, 2, 3]]) + len(capture.points)
+    larger = replace(
+        capture,
+        points=np.concatenate([capture.points, np.sqrt(area) * square + (0, 0, 0.37)]),
+        triangles=np.concatenate([capture.triangles, added]),
+        face_object=None,
+    )
+    options = IngestOptions(min_component_area_m2=least)
+    mesh = _train(larger, name="mesh.ply")
+    statement = capture.folder / "dataparser_transforms.json"
+    assert area * json.loads(statement.read_text())["scale"] ** 2 < least < area
     before = read_scan(capture.folder, options)
-    write_ply(mesh, points, capture.triangles, capture.face_object)
-    (capture.folder / "dataparser_transforms.json").unlink()
+    write_ply(mesh, larger.points, larger.triangles)
+    statement.unlink()
     after = read_scan(capture.folder, options)
+    assert len(after.objects) > 1
     assert [o.label for o in before.objects] == [o.label for o in after.objects]
 
 
