@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
 from tests.scenes import edited, make_capture, write_ply
@@ -132,6 +133,26 @@ def test_a_statement_that_says_no_frame_is_refused(capture, stated):
     (capture.folder / "dataparser_transforms.json").write_text(json.dumps(stated))
     with pytest.raises(InputRefused, match=r"nobody knows where the mesh lies.*\[mesh\.frame\]$"):
         read_scan(capture.folder, IngestOptions())
+
+
+def test_a_usd_mesh_is_read_as_it_lies_and_says_so(capture):
+    """USD states its own unit and axes, in which nobody exports from nerfstudio."""
+    mesh = _train(capture, name="poisson_mesh.ply")
+    stage = Usd.Stage.CreateNew(str(capture.folder / "mesh.usda"))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    made = UsdGeom.Mesh.Define(stage, "/room")
+    stage.SetDefaultPrim(made.GetPrim())
+    made.CreatePointsAttr(capture.points.astype(np.float32))
+    made.CreateFaceVertexCountsAttr(np.full(len(capture.triangles), 3, np.int32))
+    made.CreateFaceVertexIndicesAttr(capture.triangles.ravel().astype(np.int32))
+    stage.Save()
+    mesh.unlink()
+    (capture.folder / "objects.json").unlink()
+    scan = read_scan(capture.folder, IngestOptions(mesh=capture.folder / "mesh.usda"))
+    np.testing.assert_allclose(np.ptp(scan.mesh.points, axis=0), np.ptp(capture.points, axis=0))
+    (said,) = (sentence for sentence in scan.warnings if "[mesh.frame]" in sentence)
+    assert "mesh.usda: is read as it lies; dataparser_transforms.json beside it" in said
 
 
 def test_the_points_that_nerfstudio_begins_from_are_no_mesh(capture):
