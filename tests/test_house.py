@@ -240,6 +240,7 @@ ENGINEERING: dict[str, str] = {
     "_FULL_FRAME_MM": "convention of a format",
     "_GAP": "keeps lights off surfaces",
     "_GEOCENTRIC": "limit of what is refused",
+    "_GLOBAL": "codes of EPSG",
     "_GIVEN": "numerics: next to no spread",
     "_GLOSS": "discretisation of the search",
     "_GOLDEN": "mathematics",

@@ -11,7 +11,7 @@ import pytest
 
 from tests.scenes import make_capture
 from usdbrdf.capture import adapters
-from usdbrdf.capture.adapters import list_adapters, read_scan
+from usdbrdf.capture.adapters import choose_adapter, list_adapters, read_scan
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.options import IngestOptions
@@ -131,6 +131,29 @@ def test_one_that_fails_while_it_looks_or_reads_does_not_stop_us(announce, tmp_p
 def test_ours_cannot_be_replaced(announce):
     announce(transforms=_THEIRS)
     assert [a.origin for a in list_adapters()] == list(adapters.MODULES.values())
+
+
+@pytest.mark.parametrize(
+    ("stray", "said", "theirs"),
+    [
+        ("block.xml", "<BlocksExchange>", "blocks-exchange"),
+        ("a_parameters.txt", "fileName imageWidth imageHeight", "pix4d"),
+        ("bundle.out", "# Bundle file v0.3", "bundler"),
+        ("a.nvm", "NVM_V3", "visualsfm"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("own", "adapter"), [("poses_bounds.npy", "llff"), ("stage.usda", "usd"), ("room.e57", "e57")]
+)
+def test_what_other_programs_leave_in_a_capture_does_not_stand_for_it(
+    tmp_path, stray, said, theirs, own, adapter
+):
+    """Its cameras are those that another format was made from, or of an attempt."""
+    (tmp_path / stray).write_text(said)
+    assert choose_adapter(tmp_path).name == theirs
+    (tmp_path / own).write_bytes(b"")
+    assert choose_adapter(tmp_path).name == adapter
+    assert choose_adapter(tmp_path / stray).name == theirs
 
 
 def test_nothing_recognised_says_so_in_a_sentence(tmp_path):

@@ -4,9 +4,11 @@ dataparser does (nerfstudio_dataparser.py, auto_orient_and_center_poses)."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
 from tests.scenes import edited, make_capture, write_ply
@@ -90,17 +92,26 @@ def test_an_exported_mesh_alone_says_what_is_missing(capture):
 
 
 def test_areas_are_those_of_the_capture(capture):
-    """Parts of less than a square metre; the training's metre is larger."""
-    document = json.loads((capture.folder / "objects.json").read_text())
+    """A part that is large enough, and would be too small in the training's metres, which are
+    larger."""
     (capture.folder / "objects.json").unlink()
-    mesh = _train(capture, name="mesh.ply")
-    points = read_scan(capture.folder, IngestOptions()).mesh.points
-    assert len(document["objects"]) > 1
-    options = IngestOptions(objects=None, min_component_area_m2=1.0)
+    area, least, square = 1.1, 1.05, np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    added = np.array([[0, 1, 2], [0, 2, 3]]) + len(capture.points)
+    larger = replace(
+        capture,
+        points=np.concatenate([capture.points, np.sqrt(area) * square + (0, 0, 0.37)]),
+        triangles=np.concatenate([capture.triangles, added]),
+        face_object=None,
+    )
+    options = IngestOptions(min_component_area_m2=least)
+    mesh = _train(larger, name="mesh.ply")
+    statement = capture.folder / "dataparser_transforms.json"
+    assert area * json.loads(statement.read_text())["scale"] ** 2 < least < area
     before = read_scan(capture.folder, options)
-    write_ply(mesh, points, capture.triangles, capture.face_object)
-    (capture.folder / "dataparser_transforms.json").unlink()
+    write_ply(mesh, larger.points, larger.triangles)
+    statement.unlink()
     after = read_scan(capture.folder, options)
+    assert len(after.objects) > 1
     assert [o.label for o in before.objects] == [o.label for o in after.objects]
 
 
@@ -124,6 +135,26 @@ def test_a_statement_that_says_no_frame_is_refused(capture, stated):
         read_scan(capture.folder, IngestOptions())
 
 
+def test_a_usd_mesh_is_read_as_it_lies_and_says_so(capture):
+    """USD states its own unit and axes, in which nobody exports from nerfstudio."""
+    mesh = _train(capture, name="poisson_mesh.ply")
+    stage = Usd.Stage.CreateNew(str(capture.folder / "mesh.usda"))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    made = UsdGeom.Mesh.Define(stage, "/room")
+    stage.SetDefaultPrim(made.GetPrim())
+    made.CreatePointsAttr(capture.points.astype(np.float32))
+    made.CreateFaceVertexCountsAttr(np.full(len(capture.triangles), 3, np.int32))
+    made.CreateFaceVertexIndicesAttr(capture.triangles.ravel().astype(np.int32))
+    stage.Save()
+    mesh.unlink()
+    (capture.folder / "objects.json").unlink()
+    scan = read_scan(capture.folder, IngestOptions(mesh=capture.folder / "mesh.usda"))
+    np.testing.assert_allclose(np.ptp(scan.mesh.points, axis=0), np.ptp(capture.points, axis=0))
+    (said,) = (sentence for sentence in scan.warnings if "[mesh.frame]" in sentence)
+    assert "mesh.usda: is read as it lies; dataparser_transforms.json beside it" in said
+
+
 def test_the_points_that_nerfstudio_begins_from_are_no_mesh(capture):
     points = [" ".join(map(str, p)) for p in capture.points.tolist()]
     head = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
@@ -133,6 +164,18 @@ def test_the_points_that_nerfstudio_begins_from_are_no_mesh(capture):
     assert len(read_scan(capture.folder, IngestOptions()).mesh.points) == len(capture.points)
     (capture.folder / "room.ply").unlink()
     with pytest.raises(InputRefused, match=r"no mesh \(sparse_pc\.ply holds points alone\)\. Put"):
+        read_scan(capture.folder, IngestOptions())
+
+
+def test_points_are_known_by_their_header_whatever_they_are_called(capture):
+    """OpenMVS and COLMAP's users call meshes fused.ply too."""
+    (capture.folder / "mesh.ply").rename(capture.folder / "fused.ply")
+    cloud = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+    cloud += b"property float z\nelement face 0\nproperty list uchar int vertex_indices\n"
+    (capture.folder / "room.ply").write_bytes(cloud + b"end_header\n0 0 0\n")
+    assert len(read_scan(capture.folder, IngestOptions()).mesh.points) == len(capture.points)
+    (capture.folder / "fused.ply").unlink()
+    with pytest.raises(InputRefused, match=r"no mesh \(room\.ply holds points alone\)\. Put"):
         read_scan(capture.folder, IngestOptions())
 
 

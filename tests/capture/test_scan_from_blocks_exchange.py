@@ -195,7 +195,7 @@ def test_photographs_that_were_not_placed_are_left_out(tmp_path):
     [
         (">Perspective<", ">Fisheye<", "cameras of the type 'Fisheye' are not read"),
         ("<Skew>0<", "<Skew>0.5<", "cameras with AspectRatio or Skew are not read"),
-        ("<SRSId>2<", "<SRSId>0<", r"its coordinates are longitudes and latitudes \(EPSG:4326"),
+        ("<SRSId>2<", "<SRSId>0<", r"its coordinates are longitudes .*\(EPSG:4326"),
         (f">{ENU}<", ">WGS84<", "its coordinates are longitudes and latitudes"),
         ("<Rotation>", "<Rot>", "not valid XML"),
         ("Rotation>", "Rot>", "no photograph with rotation and centre"),
@@ -232,7 +232,15 @@ def test_a_model_in_tiles_or_of_another_system_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "system", ["LOCAL_CS[&quot;Local (m)&quot;]", "WGS 84 / UTM zone 17N", "PROJCS[&quot;WGS 84"]
+    "system",
+    [
+        "LOCAL_CS[&quot;Local (m)&quot;]",
+        "WGS 84 / UTM zone 17N",
+        "PROJCS[&quot;WGS 84 / UTM zone 17N&quot;,GEOGCS[&quot;WGS 84&quot;]]",
+        "EPSG:32617+5773",
+        "EPSG:4549",  # CGCS2000 / 3-degree Gauss-Kruger, among the codes of geographic ones
+        "EPSG:4647",  # ETRS89 / UTM zone 32N (zE-N)
+    ],
 )
 def test_systems_whose_coordinates_are_lengths_are_read(tmp_path, system):
     room = truth().square()
@@ -247,3 +255,51 @@ def test_of_several_blocks_the_one_with_most_poses_is_read(tmp_path):
     scan = read_scan(tmp_path, OPTIONS)
     assert_same(scan, room)
     assert any("2 blocks; taken is 'Block_1 - AT'" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        "EPSG:4258", "EPSG:4269+5703", "epsg: 4283", "EPSG:4490", "EPSG:4978", "EPSG:6318",
+        "EPSG:7844", "urn:ogc:def:crs:EPSG:9.8:4258", "+proj=latlong +datum=WGS84",
+        "GEOGCS[&quot;ETRS89&quot;]", "GEOGRAPHICCRS[&quot;ETRS89&quot;]",
+        "COMPD_CS[&quot;a&quot;,GEOGCS[&quot;NAD83&quot;],VERT_CS[&quot;NAVD88&quot;]]",
+        "GEOCCS[&quot;WGS 84&quot;]", "GEODCRS[&quot;WGS 84&quot;]",
+    ],
+)  # fmt: skip
+def test_systems_in_degrees_are_refused(tmp_path, system):
+    room = truth().square()
+    _write(tmp_path, room, _document(room).replace(f">{ENU}<", f">{system}<"))
+    with pytest.raises(InputRefused, match=r"longitudes and latitudes, or from the Earth's centre"):
+        read_scan(tmp_path, OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("model", "block", "warned"),
+    [
+        ("EPSG:32617", "EPSG:32617+5773", 1),
+        ("EPSG: 32617 + 5773", "epsg:32617", 1),
+        ("EPSG:32617+5773", "EPSG:32617+5773", 0),
+        ("EPSG:32617+5703", "EPSG:32617+5773", None),
+        ("EPSG:32618", "EPSG:32617+5773", None),
+    ],
+)
+def test_of_a_models_system_the_horizontal_part_is_the_blocks(tmp_path, model, block, warned):
+    room = truth().square()
+    _write(tmp_path, room, _document(room).replace(f">{ENU}<", f">{block}<"))
+    text = f"<SRS>{model}</SRS><SRSOrigin>0,0,0</SRSOrigin>"
+    (tmp_path / "metadata.xml").write_text(f"<ModelMetadata>{text}</ModelMetadata>")
+    if warned is None:
+        with pytest.raises(InputRefused, match=r"Export both in one\. \[capture\.unit\]$"):
+            read_scan(tmp_path, OPTIONS)
+        return
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, room)
+    assert sum("one says nothing of heights" in said for said in scan.warnings) == warned
+
+
+def test_of_several_documents_one_is_to_be_named(tmp_path):
+    for name in ("a.xml", "b.xml"):
+        (tmp_path / name).write_text("<BlocksExchange/>")
+    with pytest.raises(InputRefused, match=r": 2 documents of BlocksExchange XML\. Name the file"):
+        read_scan(tmp_path, OPTIONS)

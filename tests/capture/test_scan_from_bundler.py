@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
-from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
 from usdbrdf.capture.reconstructions.bundler import shots_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
@@ -56,6 +56,24 @@ def test_the_document_is_the_room(tmp_path, name, listed, line):
     scan = read_scan(tmp_path, OPTIONS)
     assert_same(scan, room, names=room.names)
     assert scan.adapter == "bundler"
+
+
+@pytest.mark.parametrize("named", ["bundle/bundle.out", "bundle"])
+def test_the_list_is_found_above_the_folder_of_bundler(tmp_path, named):
+    room = truth().centred()
+    _write(tmp_path, room, _document(room), "bundle/bundle.out")
+    scan = read_scan(tmp_path / named, OPTIONS)
+    assert_same(scan, room)
+    beside = files_beside(choose_adapter(tmp_path / named), tmp_path / named, None)
+    own = [tmp_path / "list.txt", tmp_path / "mesh.obj"]
+    assert beside == sorted([*scan.frames.image_paths, *own])
+    assert files_beside(choose_adapter(tmp_path), tmp_path, None) == []
+
+
+def test_a_capture_may_be_called_as_the_folder_of_bundler(tmp_path):
+    room = truth().centred()
+    _write(tmp_path / "bundle", room, _document(room))
+    assert_same(read_scan(tmp_path / "bundle/bundle.out", OPTIONS), room)
 
 
 def test_folders_of_pmvs_have_their_pictures_undistorted_and_numbered(tmp_path):
@@ -108,12 +126,18 @@ def test_distortions_are_those_of_bundler(tmp_path):
     ("broken", "said"),
     [
         (lambda text: text[: len(text) // 2], "It was cut off, or is of another format"),
-        (lambda text: text.replace("10 1\n", "10\n", 1), "0 cameras of 15 numbers"),
-        (lambda text: text.replace("10 1\n", "1e300 1\n", 1), "0 cameras of 15 numbers"),
-        (lambda text: text.replace("10 1\n", "nan 1\n", 1), "0 cameras of 15 numbers"),
+        (lambda text: text.replace("10 1\n", "10\n", 1), "says how many cameras and points follow"),
+        (
+            lambda text: text.replace("10 1\n", "1e300 1\n", 1),
+            "says how many cameras and points follow",
+        ),
+        (
+            lambda text: text.replace("10 1\n", "nan 1\n", 1),
+            "says how many cameras and points follow",
+        ),
         (lambda text: text.replace("10 1\n", "9 1\n", 1), "9 cameras, but 10 pictures in the list"),
         (lambda text: text.replace("10 1\n", "10 1\nfocal length\n", 1), "not a row of numbers"),
-        (lambda text: HEAD, "0 cameras of 15 numbers where it announces 0"),
+        (lambda text: HEAD, "no line at its beginning says"),
     ],
 )
 def test_a_broken_file_is_refused(tmp_path, broken, said):

@@ -434,6 +434,13 @@ def test_folders_as_those_have_them_who_train_splats(splats, gone, taken, bends)
         np.testing.assert_allclose(scan.frames.intrinsics[0], expected)
 
 
+def test_images_of_full_size_are_taken_although_one_is_missing(splats):
+    (splats.folder / "images/0004.exr").unlink()
+    scan = read_scan(splats.folder, OPTIONS)
+    assert (len(scan.frames), _taken(scan)) == (9, {"images"})
+    assert any("1 of 10 frames dropped, '0004.exr'" in said for said in scan.warnings)
+
+
 def test_the_only_folder_that_holds_the_images_is_theirs(splats):
     for name in ("images_2", "images_4", "input", "distorted"):
         shutil.rmtree(splats.folder / name)
@@ -442,11 +449,39 @@ def test_the_only_folder_that_holds_the_images_is_theirs(splats):
     scan = read_scan(splats.folder, OPTIONS)
     assert _taken(scan) == {"my pictures"}
     assert any("are taken from work/my pictures/, the only folder" in s for s in scan.warnings)
-    shutil.copytree(splats.folder / "work/my pictures", splats.folder / "work/normals")
-    with pytest.raises(InputRefused, match=r"work/my pictures, work/normals all hold the images"):
+    shutil.copytree(splats.folder / "work/my pictures", splats.folder / "work/some copies")
+    with pytest.raises(InputRefused, match="my pictures, work/some copies all hold the"):
         read_scan(splats.folder, OPTIONS)
     named = replace(OPTIONS, frames=splats.folder / "work/my pictures")
     assert _taken(read_scan(splats.folder, named)) == {"my pictures"}
     shutil.rmtree(splats.folder / "work")
     with pytest.raises(InputRefused, match=r"none of the images .* is there, first '0000\.exr'"):
         read_scan(splats.folder, OPTIONS)
+
+
+@pytest.mark.parametrize("layer", ["normals", "depth_anything", "work/mono_depth", "sky Masks"])
+def test_layers_are_not_taken_for_the_photographs(splats, layer):
+    """However many they are, and wherever these are."""
+    for name in ("images_2", "images_4", "input", "distorted"):
+        shutil.rmtree(splats.folder / name)
+    shutil.copytree(splats.folder / "images", splats.folder / layer)
+    (splats.folder / "images").rename(splats.folder / "pics")
+    (splats.folder / "pics/0004.exr").unlink()
+    scan = read_scan(splats.folder, OPTIONS)
+    assert (len(scan.frames), _taken(scan)) == (9, {"pics"})
+    assert any("are taken from pics/, the only folder" in said for said in scan.warnings)
+    shutil.rmtree(splats.folder / "pics")
+    with pytest.raises(InputRefused, match="none of the images that the COLMAP model names is th"):
+        read_scan(splats.folder, OPTIONS)
+
+
+def test_of_several_folders_that_with_most_images_is_taken(splats):
+    for name in ("images_2", "images_4", "input", "distorted"):
+        shutil.rmtree(splats.folder / name)
+    (splats.folder / "images").rename(splats.folder / "pics")
+    shutil.copytree(splats.folder / "pics", splats.folder / "segovia/images_2")
+    (splats.folder / "some").mkdir()
+    shutil.copy(splats.folder / "pics/0004.exr", splats.folder / "some")
+    scan = read_scan(splats.folder, OPTIONS)
+    assert _taken(scan) == {"pics"}
+    assert any("from pics/, the folder that holds most of them" in s for s in scan.warnings)

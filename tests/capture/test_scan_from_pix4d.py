@@ -15,7 +15,7 @@ from tests.format_truth import (
     write_image,
     write_obj,
 )
-from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
 from usdbrdf.capture.reconstructions.pix4d import shots_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
@@ -61,6 +61,19 @@ def test_a_project_is_the_room(tmp_path):
     scan = read_scan(tmp_path, OPTIONS)
     assert_same(scan, room, names=room.names)
     assert scan.adapter == "pix4d"
+
+
+@pytest.mark.parametrize("named", [PARAMETERS, "1_initial/params"])
+def test_the_project_is_found_above_its_parameters(tmp_path, named):
+    room = truth()
+    _write(tmp_path, room, _document(room))
+    scan = read_scan(tmp_path / named, OPTIONS)
+    assert_same(scan, room)
+    assert scan.name == tmp_path.name
+    beside = files_beside(choose_adapter(tmp_path / named), tmp_path / named, None)
+    mesh = tmp_path / "2_densification/3d_mesh/room_simplified_3d_mesh.obj"
+    assert beside == sorted([*scan.frames.image_paths, mesh])
+    assert files_beside(choose_adapter(tmp_path), tmp_path, None) == []
 
 
 def test_the_parameters_may_lie_beside_the_pictures(tmp_path):
@@ -137,3 +150,12 @@ def test_numbers_are_those_of_the_head_of_a_file(tmp_path):
     local = (world[:3, :3].T @ (point - world[:3, 3])) * (1, -1, -1)
     pixel = shot.camera.lens.project(local, shot.camera.intrinsics)
     np.testing.assert_allclose(pixel, seen[:2] / seen[2], atol=1e-9)
+
+
+def test_of_several_files_one_is_to_be_named(tmp_path):
+    for name in ("a.txt", "b.txt"):
+        (tmp_path / name).write_text(HEAD)
+    with pytest.raises(
+        InputRefused, match=r": 2 files calibrated_camera_parameters.*\. Name the one"
+    ):
+        read_scan(tmp_path, OPTIONS)

@@ -106,3 +106,12 @@ def test_damaged_cameras_are_left_out(tmp_path):
     lines[6] = f"{name} 20 0 0 0 0 1 2 3 0 0"
     _write(tmp_path, room, "\n".join(lines))
     assert len(read_scan(tmp_path, OPTIONS).frames) == 8
+
+
+def test_of_several_files_one_is_to_be_named(tmp_path):
+    for name in ("a.nvm", "b.nvm"):
+        (tmp_path / name).write_text("NVM_V3")
+    with pytest.raises(
+        InputRefused, match=r": 2 files \.nvm that begin with NVM_V3.*\. Name the one"
+    ):
+        read_scan(tmp_path, OPTIONS)

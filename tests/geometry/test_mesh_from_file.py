@@ -578,6 +578,14 @@ def test_files_of_other_kinds_say_what_to_do(tmp_path):
         mesh_from_file(tmp_path / "room.gltf")
 
 
+def test_a_mesh_whose_vertices_are_gaussians_too_is_a_mesh(tmp_path):
+    axes = "".join(f"property float {name}\n" for name in ("x", "y", "z", "f_dc_0"))
+    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{axes}element face 1\n"
+    rows = "property list uchar int vertex_indices\nend_header\n0 0 0 1\n1 0 0 1\n0 1 0 1\n"
+    (tmp_path / "mesh.ply").write_text(f"{head}{rows}3 0 1 2\n")
+    assert len(mesh_from_file(tmp_path / "mesh.ply").triangles) == 1
+
+
 def test_a_large_compressed_glb_says_that_it_is_compressed(tmp_path):
     """All of whose elements are announced, and none has bytes."""
     accessors = [

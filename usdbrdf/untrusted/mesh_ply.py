@@ -17,7 +17,7 @@ from usdbrdf.untrusted.ply_numbers import KINDS, Column, Numbers, Text, element,
 
 _NAMES = {kind: name for name, kind in reversed(KINDS.items())}
 _BEGINNING = re.compile(rb"ply[ \t]*(\r\n|\n|\r)")
-_LONGEST_HEADER = 1 << 16
+LONGEST_HEADER = 1 << 16
 _CORNERS, _UV = ("vertex_indices", "vertex_index"), "texcoord"
 _STRIPS = "tristrips"  # in place of faces, as Stanford's scans have them
 # Columns of a file's rows beside those that it names itself: no word of a header has blanks.
@@ -94,10 +94,23 @@ def _property(named: tuple[str, Array]) -> str:
     return f"property {_NAMES[array.dtype.str[1:]]} {name}"
 
 
+def holds_points_alone(content: bytes) -> bool:
+    """Whether a PLY has no faces, by its header, which the content need not go beyond."""
+    head = _header(content)
+    faces = re.search(rb"[\r\n]element[ \t]+(face|tristrips)[ \t]+0*[1-9]", head)
+    return _BEGINNING.match(head) is not None and faces is None
+
+
 def holds_splats(content: bytes) -> bool:
-    """Whether its vertices are Gaussians, as they are trained, or as they are packed."""
-    head = content[: content.find(b"end_header", 0, _LONGEST_HEADER)]
-    return re.search(rb"property[ \t]+\w+[ \t]+(f_dc_0|packed_position)\b", head) is not None
+    """Whether its vertices are Gaussians, as they are trained, or as they are packed, and no
+    mesh's."""
+    gaussian = re.search(rb"property[ \t]+\w+[ \t]+(f_dc_0|packed_position)\b", _header(content))
+    return gaussian is not None and holds_points_alone(content)
+
+
+def _header(content: bytes) -> bytes:
+    """Nothing where it does not end."""
+    return content[: max(0, content.find(b"end_header", 0, LONGEST_HEADER))]
 
 
 def ply_of(content: bytes) -> Ply:
@@ -108,7 +121,7 @@ def ply_of(content: bytes) -> Ply:
         raise ValueError("it does not begin with a line 'ply'")
     # After lines that a CR alone ends the numbers may begin with what looks like a LF.
     end = re.compile(rb"(?<=[\r\n])end_header[ \t]*(?:" + beginning[1] + rb"|\r\n|\n)")
-    last = end.search(content, 0, _LONGEST_HEADER)
+    last = end.search(content, 0, LONGEST_HEADER)
     if last is None:
         raise ValueError("no end of its header")
     header = re.split(r"[\r\n]+", _decoded(content[: last.start()]))

@@ -5,7 +5,8 @@
     CAPTURE/
       sparse/0/ or sparse/ or the folder itself     cameras and images, distorted or not
       images/, input/, images_2/ ...                as the model names them, in subfolders too;
-                                                    else the only other folder that holds them
+                                                    else the only other folder that holds them,
+                                                    none of normals, depths or masks
       dense/ or dense/0/ ...: sparse/, images/      what image_undistorter writes: used where the
                                                     distorted images are not there
       distorted/sparse/0, input/                    what those had before them, who train splats
@@ -18,6 +19,7 @@ distorted model with undistorted images would bend them a second time.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -45,8 +47,17 @@ DESCRIPTION = DESCRIPTIONS[NAME]
 _WORKSPACES = ("", "dense", "dense/0", "undistorted", "colmap", "distorted")
 _MODELS = ("", "sparse/0", "sparse")
 _IMAGES = ("images", "input", "", "images_2", "images_4", "images_8")
+# What scaled-down copies of images are in.
+_REDUCED = re.compile(r"(^|/)images_\d+$")
 # How deep in the capture other folders of images are looked for.
 _BELOW = ("*/", "*/*/")
+# Words in the names of folders whose pictures are no photographs, although they are called as these
+# are.
+_LAYERS = re.compile(
+    r"(?<![a-z])(depth|normals|normal_?maps?|masks?|semantics?|segment|seg(?![a-z])|labels?(?![a-z])"
+    r"|instances?(?![a-z])|albedo|roughness|metallic|confidence|disparit|thumb|preview)",
+    re.IGNORECASE,
+)
 # The last two are what COLMAP's own meshers write; fused.ply is a point cloud.
 _MESHES = (
     "mesh.ply", "mesh.obj", "mesh.glb", "mesh.usd", "mesh.usda", "mesh.usdc",
@@ -177,11 +188,13 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
         if not model.names:
             continue
         named += 1
-        counts = [
-            sum(pictured.of(name, f) is not None for name in model.names) for f in workspace.images
-        ]
-        if max(counts):
-            images = workspace.images[counts.index(max(counts))]
+        counts = {
+            folder: sum(pictured.of(name, folder) is not None for name in model.names)
+            for folder in workspace.images
+        }
+        counts = _of_full_size(counts)
+        if counts:
+            images = max(counts, key=counts.__getitem__)
             candidates.append(_Chosen(model, workspace.model, images))
         first = first or model.names[0]
     if not candidates and options.frames is None:
@@ -213,24 +226,36 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
     return largest
 
 
+def _of_full_size(counts: dict[str, int]) -> dict[str, int]:
+    """Of folders and how many of the images they hold those that hold any: of images_2 and the like
+    only where no other does, however many these lack."""
+    counts = {folder: count for folder, count in counts.items() if count}
+    full = {folder: count for folder, count in counts.items() if not _REDUCED.search(folder)}
+    return full or counts
+
+
 def _elsewhere(path: Path, workspaces: Sequence[_Workspace], findings: Findings) -> list[_Chosen]:
-    """The first model with images, by their very names, in one folder of the capture; InputRefused
-    where several hold them."""
-    folders = [p for below in _BELOW for p in sorted(path.glob(below)) if not p.is_symlink()]
+    """The first model with images, by their very names, in one folder of the capture that is none
+    of normals, depths or masks; InputRefused where several hold as many."""
+    below = (p for level in _BELOW for p in sorted(path.glob(level)) if not p.is_symlink())
+    folders = [p.relative_to(path).as_posix() for p in below]
+    folders = [folder for folder in folders if not _LAYERS.search(folder)]
     for workspace in workspaces:
         model = colmap_model(workspace.model)
-        counts = {p: sum((p / name).is_file() for name in model.names) for p in folders}
-        most = max(counts.values(), default=0)
-        found = [p.relative_to(path).as_posix() for p, count in counts.items() if count == most]
-        if most and len(found) > 1:
+        counts = _of_full_size(
+            {f: sum((path / f / name).is_file() for name in model.names) for f in folders}
+        )
+        found = [folder for folder, count in counts.items() if count == max(counts.values())]
+        if len(found) > 1:
             raise InputRefused(
                 f"{path}: {', '.join(found[:3])} all hold the images that the COLMAP model names. "
                 "Name the folder of the photographs with --frames. [colmap.images]"
             )
-        if most:
+        if found:
+            which = "only folder that holds" if len(counts) == 1 else "folder that holds most of"
             findings.warn(
-                f"{path.name}: the images of the COLMAP model are taken from {found[0]}/, the only "
-                "folder that holds them. [capture.file]"
+                f"{path.name}: the images of the COLMAP model are taken from {found[0]}/, the "
+                f"{which} them. [capture.file]"
             )
             return [_Chosen(model, workspace.model, found[0])]
     return []

@@ -27,12 +27,14 @@ from usdbrdf.errors import ImageRefused, InputRefused, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
 from usdbrdf.files.paths import contained
+from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.mesh_files import FileMesh
+from usdbrdf.untrusted.mesh_ply import LONGEST_HEADER, holds_points_alone
 from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 # In the order in which they are taken where one name has several: radiance first.
@@ -49,8 +51,6 @@ FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorte
 _OTHER_FOLDER = "Name the folder of the pictures with --frames, or name them relative to this one"
 _MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
-# What programs call their points, which are no mesh although PLY may hold one.
-_CLOUDS = ("sparse_pc.ply", "point_cloud.ply", "points3d.ply", "fused.ply", "sparse.ply")
 _UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
 
 
@@ -375,7 +375,7 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
         if found:
             return contained(folder, found[0].relative_to(folder).as_posix())
     there = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in _MESHES]
-    others = [p for p in there if p.name.lower() not in _CLOUDS]
+    others = [p for p in there if not holds_points_alone(beginning_of(p, LONGEST_HEADER))]
     if len(others) == 1:
         return contained(folder, others[0].name)
     unread = [p.name for p in sorted(folder.iterdir()) if p.suffix.lower() in _UNREAD_MESHES]

@@ -115,7 +115,13 @@ def geometry_at_home(
         return _moved(read, np.asarray(home, np.float64), options, meters_per_unit)
     statements = statements_beside(mesh)
     if not statements or mesh.suffix.lower() in USD_SUFFIXES:
-        if mesh.name in EXPORTED:
+        if statements:
+            findings.warn(
+                f"{mesh.name}: is read as it lies; {FILE} beside it is for meshes of nerfstudio's "
+                "own export (PLY, OBJ). Name that one with --mesh if this was made of it and has "
+                "not been moved back. [mesh.frame]"
+            )
+        elif mesh.name in EXPORTED:
             findings.warn(
                 f"{mesh.name}: is called as nerfstudio exports its meshes, which lie in the frame "
                 f"that it trained in. Put {FILE}, which lies beside the training's config.yml, "

@@ -32,8 +32,27 @@ _METADATA = "metadata.xml"
 # How deep a tile of a production lies below what tells of all.
 _ABOVE = 3
 _AXES = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
-# Coordinate systems whose coordinates are no lengths along three axes.
-_DEGREES = re.compile(r"EPSG: *(4326|4979)\b|\+proj=longlat|^\s*(WGS ?84\s*$|GEOG(CS|CRS))", re.I)
+# Coordinate systems in degrees, or from the Earth's centre: by name, by what a text of WKT names
+# first (those of projected systems lie within), and by EPSG's code of the horizontal part.
+_DEGREES = re.compile(r"\+proj=(longlat|latlong|lonlat|latlon)\b|^\s*WGS ?84\s*$", re.IGNORECASE)
+_WKT = re.compile(
+    r"\b(?:PROJ(?:CS|CRS|ECTEDCRS)|(GEO(?:G?CS|CCS|GCRS|GRAPHICCRS|DCRS|DETICCRS)))\s*[\[(]",
+    re.IGNORECASE,
+)
+_EPSG = re.compile(r"\bEPSG[:/](?:[\d.]*[:/])? *(\d+)", re.IGNORECASE)
+# EPSG's codes of these, from the first to the last; from 5000 on those of whole countries.
+_GLOBAL = (
+    (3819, 3824), (3887, 3889), (3906, 3906), (4000, 4025), (4027, 4036), (4039, 4047),
+    (4052, 4055), (4073, 4081), (4120, 4216), (4218, 4389), (4463, 4466), (4468, 4470),
+    (4472, 4473), (4475, 4483), (4490, 4490), (4555, 4558), (4600, 4646), (4657, 4765),
+    (4801, 4811), (4813, 4821), (4823, 4824), (4882, 4999), (5228, 5233), (5244, 5246),
+    (5340, 5342), (5363, 5365), (5368, 5381), (5487, 5489), (5524, 5527), (5560, 5561),
+    (6133, 6135), (6309, 6311), (6317, 6325), (6363, 6365), (6666, 6668), (6704, 6706),
+    (6978, 6983), (6985, 6990), (7656, 7686), (7796, 7798), (7842, 7844), (7879, 7881),
+    (7884, 7886), (7900, 7931), (8084, 8086), (8227, 8255), (8397, 8431), (8541, 8545),
+    (8683, 8685), (8694, 8699), (8816, 8818), (8860, 8902), (8905, 8907), (8915, 8949),
+    (8972, 9019), (9053, 9140), (9753, 9758), (9775, 9784), (9988, 9990), (10604, 10606),
+)  # fmt: skip
 
 
 def matches(path: Path) -> bool:
@@ -48,7 +67,7 @@ def _documents(path: Path) -> list[Path]:
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
     if len(documents) != 1:
-        said = f"{len(documents)} of them" if documents else "no BlocksExchange XML"
+        said = f"{len(documents) or 'no'} documents of BlocksExchange XML"
         raise InputRefused(
             f"{path}: {said}. Name the file that was exported of the aerotriangulation. "
             "[capture.format]"
@@ -60,7 +79,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     system = systems.get(_text(block, "SRSId"), "")
     tiles = sorted(source.parent.glob("Data/*/*.obj"))
     return scan_of_shots(
-        shots_of(block, _origin(source, system, options), source),
+        shots_of(block, _origin(source, system, options, findings), source),
         options,
         findings,
         adapter=NAME,
@@ -99,23 +118,47 @@ def _block(root: Element, source: Path, findings: Findings) -> Element:
     return chosen
 
 
-def _origin(source: Path, system: str, options: CaptureOptions) -> Double:
+def _is_global(system: str) -> bool:
+    """Whether coordinates of a system are degrees, or have the Earth's centre for their origin."""
+    if named := _WKT.search(system):
+        return named[1] is not None
+    code = int(epsg[1][:9]) if (epsg := _EPSG.search(system)) else 0
+    return any(low <= code <= high for low, high in _GLOBAL) or bool(_DEGREES.search(system))
+
+
+def _parts(system: str) -> tuple[str, str]:
+    """The horizontal and the vertical one of a coordinate system, "" where none is stated."""
+    system = re.sub(r"\s", "", system).upper()
+    both = re.fullmatch(r"(EPSG:\d+)\+(?:EPSG:)?(\d+)", system)
+    return (both[1], both[2]) if both else (system, "")
+
+
+def _origin(source: Path, system: str, options: CaptureOptions, findings: Findings) -> Double:
     """Of the model, in the block's coordinates; InputRefused where these are two systems."""
-    if _DEGREES.search(system):
+    if _is_global(system):
         raise InputRefused(
-            f"{source}: its coordinates are longitudes and latitudes ({system[:40]}). Export the "
-            "block in a local or projected coordinate system. [capture.unit]"
+            f"{source}: its coordinates are longitudes and latitudes, or from the Earth's centre "
+            f"({system[:40]}). Export the block in a local or projected coordinate system. "
+            "[capture.unit]"
         )
     stated = [source.parent / _METADATA] if (source.parent / _METADATA).is_file() else []
     stated += beside_mesh(options.mesh) if options.mesh is not None else []
     if not stated:
         return np.zeros(3)
     root = read_xml(stated[-1])
-    theirs, ours = (re.sub(r"\s", "", one).upper() for one in (_text(root, "SRS"), system))
-    if theirs and ours and theirs != ours:
+    model = _text(root, "SRS")
+    (theirs, their_height), (ours, our_height) = _parts(model), _parts(system)
+    one_height = their_height == our_height or not (their_height and our_height)
+    if theirs and ours and not (theirs == ours and one_height):
         raise InputRefused(
-            f"{stated[-1]}: the model is in the coordinate system {theirs[:60]}, the cameras of "
-            f"{source.name} are in {ours[:60]}. Export both in one. [capture.unit]"
+            f"{stated[-1]}: the model is in the coordinate system {model[:60]}, the cameras of "
+            f"{source.name} are in {system[:60]}. Export both in one. [capture.unit]"
+        )
+    if theirs and ours and their_height != our_height:
+        findings.warn(
+            f"{stated[-1].name}: the model is in the coordinate system {model[:60]}, the cameras "
+            f"are in {system[:60]}, of which one says nothing of heights; taken are the same. "
+            "Export both in one where the model lies too high or too low. [capture.unit]"
         )
     words = _text(root, "SRSOrigin").replace(",", " ").split()
     try:

@@ -15,7 +15,13 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import rigid_pose
-from usdbrdf.capture.reconstructions.shots import CentredCamera, Shot, scan_of_shots
+from usdbrdf.capture.reconstructions.shots import (
+    CentredCamera,
+    Shot,
+    files_of_capture,
+    folder_of,
+    scan_of_shots,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
 from usdbrdf.files.tables import beginning_of, files_of, number_rows
@@ -32,6 +38,8 @@ _LARGEST = 1_000_000  # cameras that a file may announce
 # Where PMVS has the pictures, undistorted and numbered in this order (VisualSFM, COLMAP).
 _UNDISTORTED = "visualize"
 _FOLDER = "bundle"  # where Bundler itself puts them, below its list of pictures
+_LISTS = "*list*.txt"
+_MESHES = ("mesh.*", "model.*")
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
@@ -60,7 +68,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "[capture.format]"
         )
     source = documents[0]
-    folder = source.parent if path.is_file() else path.resolve()
+    folder = _home(path)
     undistorted = (folder / _UNDISTORTED).is_dir()
     return scan_of_shots(
         shots_of(source, None if undistorted else _names(source, folder)),
@@ -70,9 +78,24 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         source=source,
         folder=folder,
         pictures_in=(_UNDISTORTED,) if undistorted else (),
-        meshes=("mesh.*", "model.*"),
+        meshes=_MESHES,
         how="Export the mesh in the frame of these cameras into this folder",
     )
+
+
+def beside(path: Path) -> list[Path]:
+    """What lies above Bundler's own folder, where that is named."""
+    home = _home(path)
+    if home == folder_of(path):
+        return []
+    return [*home.glob(_LISTS), *files_of_capture(home, meshes=_MESHES)]
+
+
+def _home(path: Path) -> Path:
+    """The capture's folder: that above Bundler's own, where this is named and has not all."""
+    folder = folder_of(path)
+    whole = (folder / _UNDISTORTED).is_dir() or any(folder.glob(_LISTS))
+    return folder.parent if folder.name == _FOLDER and not whole else folder
 
 
 def _names(source: Path, folder: Path) -> tuple[str, ...]:
@@ -81,7 +104,7 @@ def _names(source: Path, folder: Path) -> tuple[str, ...]:
     usual = [f"{stem}{mark}list.txt" for mark in (".", "_", "-")]
     named = (*usual, f"{source.name}.list.txt", "list.txt")
     places = [place / name for place in (source.parent, folder) for name in named]
-    found = next((p for p in (*places, *folder.glob("*list*.txt")) if p.is_file()), None)
+    found = next((p for p in (*places, *folder.glob(_LISTS)) if p.is_file()), None)
     if found is None:
         raise InputRefused(
             f"{source}: no {usual[0]} or list.txt beside it, which says of which pictures its "
@@ -95,12 +118,17 @@ def shots_of(source: Path, names: tuple[str, ...] | None) -> list[Shot]:
     """The photographs of a document, by their numbers where they have no names."""
     head = number_rows(source, most=1)
     count = int(head[0][0]) if head and len(head[0]) == 2 and 0 <= head[0][0] < _LARGEST else -1
-    rows = number_rows(source, most=1 + _ROWS * count)[1:] if count >= 0 else ()
+    if count < 0:
+        raise InputRefused(
+            f"{source}: no line at its beginning says how many cameras and points follow. It was "
+            "cut off, or is of another format; export it again. [capture.format]"
+        )
+    rows = number_rows(source, most=1 + _ROWS * count)[1:]
     numbers = np.concatenate(rows) if rows else np.zeros(0)
-    if count < 0 or len(numbers) != _COUNTS * count:
+    if len(numbers) != _COUNTS * count:
         raise InputRefused(
             f"{source}: {len(rows) // _ROWS} cameras of {_COUNTS} numbers where it announces "
-            f"{max(count, 0)}. It was cut off, or is of another format; export it again. "
+            f"{count}. It was cut off, or is of another format; export it again. "
             "[capture.format]"
         )
     if names is None:

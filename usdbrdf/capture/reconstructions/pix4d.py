@@ -15,7 +15,13 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import rigid_pose
-from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, scan_of_shots
+from usdbrdf.capture.reconstructions.shots import (
+    Shot,
+    ShotCamera,
+    files_of_capture,
+    folder_of,
+    scan_of_shots,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
 from usdbrdf.files.tables import beginning_of, files_of, numbers_among
@@ -26,6 +32,10 @@ from usdbrdf.options import CaptureOptions
 NAME = "pix4d"
 DESCRIPTION = DESCRIPTIONS[NAME]
 _PLACE = "1_initial/params"
+_MESHES = (
+    "mesh.*", "2_densification/3d_mesh/*_simplified_3d_mesh.obj", "*_3d_mesh.obj",
+    "2_densification/3d_mesh/*.obj",
+)  # fmt: skip
 # How the explanation at a file's head begins, and ends.
 _HEAD, _LAST = b"fileName imageWidth imageHeight", "camera model m = K [R|-Rt] X"
 # Numbers of a photograph's ten lines, of which the first begins with its name.
@@ -45,7 +55,7 @@ def _documents(path: Path) -> list[Path]:
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
     if len(documents) != 1:
-        said = f"{len(documents)} of them" if documents else "no calibrated_camera_parameters.txt"
+        said = f"{len(documents) or 'no'} files calibrated_camera_parameters.txt"
         raise InputRefused(
             f"{path}: {said}. Name the one in {_PLACE} of the project. [capture.format]"
         )
@@ -56,13 +66,23 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         findings,
         adapter=NAME,
         source=source,
-        folder=source.parent if path.is_file() else path.resolve(),
-        meshes=(
-            "mesh.*", "2_densification/3d_mesh/*_simplified_3d_mesh.obj", "*_3d_mesh.obj",
-            "2_densification/3d_mesh/*.obj",
-        ),
+        folder=_home(path),
+        meshes=_MESHES,
         how="Have the 3D textured mesh generated (OBJ), and name the project's folder",
-    )  # fmt: skip
+    )
+
+
+def beside(path: Path) -> list[Path]:
+    """What the project holds above the folder of its parameters, where that is named."""
+    home = _home(path)
+    return [] if home == folder_of(path) else files_of_capture(home, meshes=_MESHES)
+
+
+def _home(path: Path) -> Path:
+    """The capture's folder: the project's, where a place in it is named."""
+    folder = folder_of(path)
+    place = Path(_PLACE).parts
+    return folder.parents[len(place) - 1] if folder.parts[-len(place) :] == place else folder
 
 
 def shots_of(source: Path) -> list[Shot]:

@@ -4,6 +4,7 @@ camera and a pose by numbers, pictures lie in some folder, and a mesh that was e
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,7 @@ from usdbrdf.capture.formats.named_pictures import (
     warn_of_unused,
 )
 from usdbrdf.capture.up_axis import up_axis_assumed
-from usdbrdf.errors import ImageRefused
+from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
 from usdbrdf.files.tables import numbers_among
 from usdbrdf.model.arrays import Double
@@ -81,6 +82,21 @@ def size_in(row: dict[str, Any], first: str = "width", second: str = "height") -
     """A picture's size; (0, 0), which no camera has, where an object states none."""
     size = numbers_among([row.get(first), row.get(second)], 2)
     return (0, 0) if size is None or not (size >= 1).all() else (int(size[0]), int(size[1]))
+
+
+def folder_of(path: Path) -> Path:
+    """A folder, or that of a file, absolute."""
+    path = path.resolve()
+    return path if path.is_dir() else path.parent
+
+
+def files_of_capture(folder: Path, *, meshes: tuple[str, ...]) -> list[Path]:
+    """What ``scan_of_shots`` may read of a capture's folder, where a folder in it was named."""
+    files = [*pictures_of(folder, CaptureOptions()).paths]
+    files += (file for file in (folder / "masks").rglob("*") if file.is_file())
+    with suppress(InputRefused):  # of which the reader will tell, unless --mesh is given
+        files.append(mesh_beside(folder, CaptureOptions(), *meshes, how=""))
+    return files
 
 
 def scan_of_shots(

@@ -43,7 +43,7 @@ def _documents(path: Path) -> list[Path]:
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
     if len(documents) != 1:
-        said = f"{len(documents)} of them" if documents else "no .nvm that begins with NVM_V3"
+        said = f"{len(documents) or 'no'} files .nvm that begin with NVM_V3"
         raise InputRefused(f"{path}: {said}. Name the one that was exported. [capture.format]")
     (source,) = documents
     return scan_of_shots(
