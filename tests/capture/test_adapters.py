@@ -133,18 +133,16 @@ def test_ours_cannot_be_replaced(announce):
     assert [a.origin for a in list_adapters()] == list(adapters.MODULES.values())
 
 
-@pytest.mark.parametrize(
-    ("stray", "said", "theirs"),
-    [
-        ("block.xml", "<BlocksExchange>", "blocks-exchange"),
-        ("a_parameters.txt", "fileName imageWidth imageHeight", "pix4d"),
-        ("bundle.out", "# Bundle file v0.3", "bundler"),
-        ("a.nvm", "NVM_V3", "visualsfm"),
-    ],
-)
-@pytest.mark.parametrize(
-    ("own", "adapter"), [("poses_bounds.npy", "llff"), ("stage.usda", "usd"), ("room.e57", "e57")]
-)
+_STRAY = [
+    ("block.xml", "<BlocksExchange>", "blocks-exchange"),
+    ("a_parameters.txt", "fileName imageWidth imageHeight", "pix4d"),
+    ("bundle.out", "# Bundle file v0.3", "bundler"),
+    ("a.nvm", "NVM_V3", "visualsfm"),
+]
+
+
+@pytest.mark.parametrize(("stray", "said", "theirs"), _STRAY)
+@pytest.mark.parametrize(("own", "adapter"), [("poses_bounds.npy", "llff"), ("room.e57", "e57")])
 def test_what_other_programs_leave_in_a_capture_does_not_stand_for_it(
     tmp_path, stray, said, theirs, own, adapter
 ):
@@ -154,6 +152,16 @@ def test_what_other_programs_leave_in_a_capture_does_not_stand_for_it(
     (tmp_path / own).write_bytes(b"")
     assert choose_adapter(tmp_path).name == adapter
     assert choose_adapter(tmp_path / stray).name == theirs
+
+
+@pytest.mark.parametrize(("stray", "said", "theirs"), _STRAY)
+def test_a_mesh_in_usd_beside_a_programs_cameras_is_no_stage_of_photographs(
+    tmp_path, stray, said, theirs
+):
+    (tmp_path / stray).write_text(said)
+    (tmp_path / "mesh.usda").write_text("#usda 1.0")
+    assert choose_adapter(tmp_path).name == theirs
+    assert choose_adapter(tmp_path / "mesh.usda").name == "usd"
 
 
 def test_nothing_recognised_says_so_in_a_sentence(tmp_path):

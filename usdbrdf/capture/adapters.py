@@ -45,11 +45,11 @@ MODULES = {
     "fipt": "usdbrdf.capture.formats.fipt",
     "llff": "usdbrdf.capture.formats.llff",
     "e57": "usdbrdf.capture.formats.e57",
-    "usd": "usdbrdf.capture.formats.usd_stage",
     "blocks-exchange": "usdbrdf.capture.reconstructions.blocks_exchange",
     "pix4d": "usdbrdf.capture.reconstructions.pix4d",
     "bundler": "usdbrdf.capture.reconstructions.bundler",
     "visualsfm": "usdbrdf.capture.reconstructions.visualsfm",
+    "usd": "usdbrdf.capture.formats.usd_stage",
     "alembic": "usdbrdf.capture.formats.alembic",
 }
 DESCRIPTIONS = {
@@ -70,11 +70,11 @@ DESCRIPTIONS = {
     "fipt": "HDR room of FIPT, photographed (cam.txt, K_list.txt) or rendered (train/, val/)",
     "llff": "pictures with LLFF's poses_bounds.npy, and a mesh",
     "e57": "E57 with the stations of pictures, the pictures extracted beside it, and a mesh",
-    "usd": "USD stage whose cameras are the photographs (back plates, or pictures by name)",
     "blocks-exchange": "block of ContextCapture (BlocksExchange XML), pictures, and its model",
     "pix4d": "project of Pix4Dmapper (1_initial/params), its photographs, and its mesh",
     "bundler": "cameras as Bundler writes them (bundle.out, list.txt), pictures, and a mesh",
     "visualsfm": "reconstruction of VisualSFM (.nvm), pictures, and a mesh",
+    "usd": "USD stage whose cameras are the photographs (back plates, or pictures by name)",
     "alembic": "Alembic cameras: not read, says how to convert them",
 }
 
