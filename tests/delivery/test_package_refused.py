@@ -145,3 +145,13 @@ def test_a_disk_that_takes_half_of_a_package_is_no_defect(tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert not list(made.parent.iterdir())
     write_usdz(made, tmp_path, ["room.usda", "a.png", "b.png"])
+
+
+def test_names_that_are_not_ascii_are_packed(tmp_path):
+    (tmp_path / "room.usda").write_text(
+        '#usda 1.0\ndef "a" {\n    asset picture = @./Stühle.png@\n}\n', "utf-8"
+    )
+    (tmp_path / "Stühle.png").write_bytes(b"picture")
+    made = tmp_path / "room.usdz"
+    write_usdz(made, tmp_path, ["room.usda", "Stühle.png"])
+    assert Sdf.ZipFile.Open(str(made)).GetFileNames() == ["room.usda", "Stühle.png"]

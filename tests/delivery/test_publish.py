@@ -17,6 +17,7 @@ from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
 from tests.json_schemas import check
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
+from usdbrdf.asset.readers import tried
 from usdbrdf.asset.review import write_review
 from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.delivery.publish import publish, versions_in
@@ -318,6 +319,29 @@ def Xform "grape"
 {
 }
 """
+
+
+def test_what_an_artist_references_is_tried_together(room, tmp_path, monkeypatch):
+    """A child process takes a second."""
+    asked = []
+    child = tried.run_child
+
+    def counted(function, arrays, task, *more):
+        asked.append({Path(file).name for file in task["layers"]})
+        return child(function, arrays, task, *more)
+
+    monkeypatch.setattr(tried, "run_child", counted)
+    names = {f"prop{i}.usda" for i in range(4)}
+    for name in names:
+        (room.asset.folder / name).write_text(f'#usda 1.0\n# {name}\ndef Xform "grape" {{\n}}\n')
+    edit(
+        room,
+        "".join(
+            f'def "p{i}" (prepend references = @./prop{i}.usda@</grape>) {{}} ' for i in range(4)
+        ),
+    )
+    publish(room.asset.folder, tmp_path / "dest")
+    assert [files for files in asked if files & names] == [names]
 
 
 def test_file_formats_keep_what_they_are_told(room, tmp_path):

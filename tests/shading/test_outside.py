@@ -240,7 +240,6 @@ def test_where_next_to_nothing_shines_the_rest_is_dark_too(yard, stars: float, n
     every = np.ones(len(lit), np.bool_)
     found = light_from_outside(surface, lit, CoverageMap.of(every, ~every), seen, True, seed=3)
     assert found is not None
-    assert found.is_inferred is not night
     unseen = ~looked_at.coverage.measured.reshape(HEIGHT, WIDTH)
     assert (found.environment.image[unseen].max() < 0.01) == night
     known = found.environment.image[~unseen]

@@ -160,20 +160,17 @@ def _reached(start: Sequence[Path], stop: set[Path]) -> dict[Path, Sdf.Layer]:
     """Copies of the layers at ``start``, and of those that they name, directly or by others."""
     found: dict[Path, Sdf.Layer] = {}
     waiting = [*start]
-    while waiting:
-        file = waiting.pop(0)
-        if file in found or file in stop:
-            continue
-        found[file] = _copy_of(file)
-        for path in sorted(named_files(found[file])):
-            for target in _targets(file, path):
-                if target.suffix.lower() in _LAYERS and target.is_file():
-                    waiting.append(target)
+    # As many as are known of at a time, for a child takes a second.
+    while new := [file for file in dict.fromkeys(waiting) if file not in {*found, *stop}]:
+        try_layers(new)
+        found |= {file: _copy_of(file) for file in new}
+        named = [(file, path) for file in new for path in sorted(named_files(found[file]))]
+        targets = [target for file, path in named for target in _targets(file, path)]
+        waiting = [t for t in targets if t.suffix.lower() in _LAYERS and t.is_file()]
     return found
 
 
 def _copy_of(file: Path) -> Sdf.Layer:
-    try_layers([file])
     try:
         copy, why = Sdf.Layer.OpenAsAnonymous(str(file)), "it is not there"
     except Tf.ErrorException as error:

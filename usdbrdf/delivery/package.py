@@ -67,6 +67,7 @@ _LEFT_OUT_SCHEMAS = ("UsdBrdfAovAPI:", *SCHEMAS_OF_PHOTOGRAPHS)
 USDZ, GLB = ".usdz", ".glb"
 # A zip archive stores local times; one and the same, so that equal content is equal bytes.
 _PINNED_TIME = (2000, 1, 1, 0, 0, 0, 0, 1, -1)
+_UTF8 = 0x800  # flag of a name in a zip archive
 ARKIT = "arkit"
 
 
@@ -464,6 +465,11 @@ def _is_whole(package: Path, members: Sequence[str]) -> bool:
     """Whether all that was packed can be read: USD's writer goes on where the disk is full."""
     try:
         with zipfile.ZipFile(package) as found:
-            return set(members) <= set(found.namelist()) and found.testzip() is None
-    except (zipfile.BadZipFile, OSError, EOFError):
+            # USD writes UTF-8 without the flag that says so; Python takes it for code page 437.
+            names = {
+                item.filename if item.flag_bits & _UTF8 else item.filename.encode("cp437").decode()
+                for item in found.infolist()
+            }
+            return set(members) <= names and found.testzip() is None
+    except (zipfile.BadZipFile, OSError, EOFError, UnicodeDecodeError):
         return False

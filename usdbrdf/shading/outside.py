@@ -106,11 +106,6 @@ class Outside:
         return not math.isnan(self.open_share)
 
     @property
-    def is_inferred(self) -> bool:
-        """More than what a file tells or frames show."""
-        return not (math.isnan(self.sky_error) and math.isnan(self.sun_error))
-
-    @property
     def doubt(self) -> float:
         """Relative standard error of the light that is inferred; 0 where none is."""
         errors = (self.sky_error, self.sun_error)

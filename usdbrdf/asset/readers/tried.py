@@ -3,6 +3,7 @@ them first, but for those that this process has had tried or wrote itself."""
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -17,11 +18,12 @@ from usdbrdf.model.arrays import Array
 TIMEOUT_S = 600.0
 _ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 
-# Of files, as they are, what tells them from others: those that USD has opened alone, and together
-# with others as one stage.
+# Of files, as they are, what tells them from others: those that USD has opened alone, those that
+# it has composed as one stage, with or without ours, and those that we wrote.
 _State = tuple[int, int, int, int]
 _alone: set[_State] = set()
-_together: set[_State] = set()
+_together: set[frozenset[_State]] = set()
+_ours: set[_State] = set()
 
 
 def try_layers(files: Sequence[Path], *, together: bool = False) -> None:
@@ -31,13 +33,12 @@ def try_layers(files: Sequence[Path], *, together: bool = False) -> None:
     together  compose a stage of them, the strongest first, rather than look at each alone
     """
     _refuse_special(files)
-    there = [file for file in files if file.is_file()]
-    known = _together if together else _alone
-    states = [_state(file) for file in there]
-    if known.issuperset(states):
+    there = {file: state for file in files if (state := _state(file)) is not None}
+    strange = frozenset(there.values()) - _ours
+    if not strange or (strange in _together if together else strange <= _alone):
         return
     # All of a stage; alone, those that are new.
-    asked = [f for f, state in zip(there, states, strict=True) if together or state not in known]
+    asked = [f for f, state in there.items() if together or state in strange - _alone]
     names = f"{asked[0]} and {len(asked) - 1} layers beside it" if len(asked) > 1 else f"{asked[0]}"
     run_child(
         f"{__name__}:look_in_child",
@@ -46,8 +47,9 @@ def try_layers(files: Sequence[Path], *, together: bool = False) -> None:
         TIMEOUT_S,
         f"{names}: opening them as USD" if len(asked) > 1 else f"{names}: opening it as USD",
     )
-    known.update(states)
-    _alone.update(states)
+    _alone.update(strange)
+    if together:
+        _together.add(strange)
 
 
 def look_in_child(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
@@ -64,9 +66,8 @@ def look_in_child(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -
 
 def wrote(file: Path) -> None:
     """A layer that this process has just written: it need not be tried."""
-    state = _state(file)
-    _alone.add(state)
-    _together.add(state)
+    if (state := _state(file)) is not None:
+        _ours.add(state)
 
 
 def look_through(file: str) -> None:
@@ -93,7 +94,12 @@ def _refuse_special(files: Sequence[Path]) -> None:
             )
 
 
-def _state(file: Path) -> _State:
-    """A file keeps it when it is renamed, and has another when it was replaced or changed."""
-    found = file.stat()
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+def _state(file: Path) -> _State | None:
+    """A file keeps it when it is renamed, and has another when it was replaced or changed; None
+    where there is no file, or none any more."""
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    regular = stat.S_ISREG(found.st_mode)
+    return (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns) if regular else None
