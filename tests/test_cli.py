@@ -242,6 +242,7 @@ def test_an_empty_word_is_neither_the_default_nor_the_current_folder(
         ("--output", ["convert", capture, "--output="]),
         ("''", ["convert", "", "-o", "a"]),
         ("''", ["validate", ""]),
+        ("''", ["convert", "-q", "", "-o", "a"]),
         ("--mesh", ["convert", capture, "-o", "a", "--mesh", ""]),
         ("--rays", ["convert", capture, "-o", "a", "--rays="]),
     ]:
