@@ -242,6 +242,7 @@ def test_an_empty_word_is_neither_the_default_nor_the_current_folder(
         ("--output", ["convert", capture, "--output="]),
         ("''", ["convert", "", "-o", "a"]),
         ("''", ["validate", ""]),
+        ("''", ["convert", "-q", "", "-o", "a"]),
         ("--mesh", ["convert", capture, "-o", "a", "--mesh", ""]),
         ("--rays", ["convert", capture, "-o", "a", "--rays="]),
     ]:
@@ -433,6 +434,15 @@ def test_json_is_all_there_is_on_stdout(capture, tmp_path):
     assert summary["asset"] == str(tmp_path / "out" / "out.usda")
     assert summary["steps"]["ingest"]["reran"] is True
     assert summary["steps"]["ingest"]["frames"] == 12
+
+
+@pytest.mark.parametrize("asked", ["*", "help"])
+def test_what_usd_is_asked_to_tell_is_not_on_stdout(capture, tmp_path, monkeypatch, asked):
+    monkeypatch.setenv("TF_DEBUG", asked)
+    done = run("ingest", capture, "-o", tmp_path / "out", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "ingest" in json.loads(done.stdout)["steps"]
+    assert [file.name for file in tmp_path.iterdir()] == ["out"]
 
 
 def test_json_of_a_refused_run_is_empty(tmp_path, capsys):

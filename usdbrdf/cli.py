@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.job.interrupts import Terminated, interruptible, loading
-from usdbrdf.job.progress import fill_closed_streams, set_quiet, show, tell
+from usdbrdf.job.progress import fill_closed_streams, keep_usd_off_stdout, set_quiet, show, tell
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -19,6 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with interruptible():
             fill_closed_streams()
+            keep_usd_off_stdout()
             return _run(sys.argv[1:] if arguments is None else arguments)
     except UsdBrdfError as error:
         return _refuse(str(error), error.exit_code)

@@ -14,7 +14,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -52,8 +52,9 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
     name, words = (arguments[0], list(arguments[1:])) if arguments else ("nothing", [])
     if name not in commands:
         raise UsageError(f"{name}: expected a command. See usdbrdf --help. [usage.command]")
-    _refuse_empty(words)
     said, given = _said(commands[name]), {}
+    valued = [x.option for x in said if x.field.kind is not bool and not x.option.placed]
+    _refuse_empty(words, {name for option in valued for name in option.names})
     # Nothing that was or must be said needs a parser, which takes time to load.
     if words or any(item.field.default is REQUIRED for item in said):
         with loading():
@@ -71,13 +72,16 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
     return command
 
 
-def _refuse_empty(words: Sequence[str]) -> None:
+def _refuse_empty(words: Sequence[str], with_value: Set[str]) -> None:
     """UsageError for a word that says nothing, such as a variable of a shell that is not set, which
-    cyclopts takes for the default, and Python, as a path, for the current folder."""
+    cyclopts takes for the default, and Python, as a path, for the current folder.
+
+    with_value  options that the word after them belongs to
+    """
     for before, word in pairwise(["", *words]):
         option, equals, value = word.partition("=") if word.startswith("-") else ("", "", word)
         if not value and (equals or not option):
-            subject = option or (before if before.startswith("-") else "") or "''"
+            subject = option or (before if before in with_value else "") or "''"
             raise UsageError(
                 f"{subject}: the word given here is empty. Give a value, or leave it out. "
                 "[usage.option]"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import shlex
 from pathlib import Path
@@ -13,7 +15,8 @@ from tests.fault_injection import run_fresh
 from tests.json_schemas import checked
 from usdbrdf.cli import main
 from usdbrdf.commands import COMMANDS
-from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, UsageError
+from usdbrdf.farm import bundle as bundles
 from usdbrdf.farm.bundle import bundle_of, write_bundle
 from usdbrdf.farm.options import FarmOptions
 from usdbrdf.farm.scans import list_of, listed_in, numbers_in, read_list
@@ -286,6 +289,22 @@ def test_a_folder_of_somebody_else_stays(tmp_path):
     with pytest.raises(OwnershipConflict, match=r"\[farm.folder\]"):
         write_bundle(tmp_path / "link", scans, made)
     assert [*(tmp_path / "theirs").iterdir()] == [tmp_path / "theirs/letter.txt"]
+
+
+def test_a_full_disk_leaves_no_folder_behind(tmp_path, monkeypatch):
+    scans = list_of(folders(tmp_path, "a"))
+    made = bundle_of("b", scans, ConvertOptions(), FarmOptions())
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(bundles, "write_json", full)
+    (tmp_path / "there").mkdir()
+    for place in ("new/job", "there"):
+        with pytest.raises(EnvironmentFailure):
+            write_bundle(tmp_path / place, scans, made)
+    assert not (tmp_path / "new").exists()
+    assert not [*(tmp_path / "there").iterdir()]
 
 
 @pytest.mark.parametrize("text", ["", "0-3", "4", "x", "3-1", "1-", "1-3:0", "-1"])

@@ -23,15 +23,20 @@ ENDS = [
 @pytest.fixture(autouse=True)
 def _heard():
     """A shell that runs this in the background has its SIGINT ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    hung_up = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    before = {number: signal.getsignal(number) for number, _ in ENDS}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
-    signal.signal(signal.SIGINT, before)
-    signal.signal(signal.SIGHUP, hung_up)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.parametrize(("number", "ends"), ENDS)
 def test_one_that_a_callback_swallows_comes_again(number, ends):
+    """As itself: the others may be ignored."""
+    for other in {number for number, _ in ENDS} - {number}:
+        signal.signal(other, signal.SIG_IGN)
+
     @ctypes.CFUNCTYPE(None)
     def from_outside() -> None:
         os.kill(os.getpid(), number)

@@ -370,7 +370,9 @@ def test_a_picture_never_takes_the_place_of_a_photograph(
     if many:
         options = replace(options, views=_views(tmp_path, "0000"), camera=None)
         outputs = [tmp_path / "way"]
-    for output in outputs:
-        with pytest.raises(OwnershipConflict, match=r"photograph.*\[relight.output\]"):
+    for output, which in zip(
+        outputs, ("one of the capture's photographs", "the file of --lights"), strict=False
+    ):
+        with pytest.raises(OwnershipConflict, match=rf"this is {which}.*\[relight.output\]"):
             relight(room, output, options)
     assert {file.read_text() for file in (photograph, sky)} == {"the only one"}

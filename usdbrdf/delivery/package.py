@@ -10,8 +10,7 @@ from __future__ import annotations
 import os
 import time
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -49,7 +48,7 @@ from usdbrdf.errors import (
     UsageError,
     UsdBrdfError,
 )
-from usdbrdf.files.atomic import environment_failures, make_folders, publish, temporary_beside
+from usdbrdf.files.atomic import environment_failures, folder_of, publish, temporary_beside
 from usdbrdf.files.colour import WORKING_SPACE
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
@@ -274,7 +273,7 @@ def write_package(
     glb = output.suffix.lower() == GLB
     stage = stage_in_look(asset, options.look)
     flat = flattened(stage, asset, with_lights=not glb and options.profile != ARKIT)
-    with environment_failures(str(output)), _folder_of(output), scratch_folder() as made:
+    with environment_failures(str(output)), folder_of(output), scratch_folder() as made:
         reduced: dict[str, int] = {}
         if options.low_poly is not None:
             count = make_low_poly(flat, asset, made, options.low_poly, warn)
@@ -306,7 +305,7 @@ def _write_whole(output: Path, asset: Asset, options: PackageOptions) -> dict[st
     def describe(layer: Sdf.Layer) -> None:
         layer.documentation = "A packed asset: all its looks and lightings are variants."
 
-    with environment_failures(str(output)), _folder_of(output):
+    with environment_failures(str(output)), folder_of(output):
         with scratch_folder() as folder:
             found = write_copy(
                 asset,
@@ -378,19 +377,6 @@ def _write_usdz(
         export(flat.GetRootLayer(), folder / root, folder=folder)
         write_usdz(output, folder, [root, *sorted({*packed, *others.values()})])
     return len(packed)
-
-
-@contextmanager
-def _folder_of(output: Path) -> Iterator[None]:
-    """Make the folders above a file; those that hold nothing at the end go again."""
-    made = [folder for folder in output.parents if not folder.exists()]
-    try:
-        make_folders(output.parent)
-        yield
-    finally:
-        for folder in made:  # the innermost first
-            with suppress(OSError):  # it is not empty, or was never made
-                folder.rmdir()
 
 
 def _texture_format(output: Path, asset: Asset, options: PackageOptions) -> Literal["exr", "png"]:

@@ -23,7 +23,14 @@ from typing import Any
 from usdbrdf.errors import OwnershipConflict, UsageError
 from usdbrdf.farm.options import FarmOptions
 from usdbrdf.farm.scans import RESULTS_FOLDER, SCANS_FILE, ScanList, list_document
-from usdbrdf.files.atomic import environment_failures, flush_folder, is_bare, move, temporary_folder
+from usdbrdf.files.atomic import (
+    environment_failures,
+    flush_folder,
+    folder_of,
+    is_bare,
+    move,
+    temporary_folder,
+)
 from usdbrdf.files.documents import write_json
 from usdbrdf.option import Option, OptionField, Options, option_fields
 from usdbrdf.options import ConvertOptions
@@ -117,7 +124,7 @@ def write_bundle(folder: Path, scans: ScanList, bundle: Bundle) -> None:
             REFERENCES: bundle.references,
             TEMPLATE: bundle.template,
         }
-        with temporary_folder(folder / TEMPLATE) as staged:
+        with folder_of(folder / TEMPLATE), temporary_folder(folder / TEMPLATE) as staged:
             for name, document in documents.items():
                 write_json(staged / name, document)
             changed = [name for name in documents if not _are_same(staged / name, folder / name)]

@@ -73,6 +73,19 @@ def make_folders(folder: Path) -> None:
         flush_folder(new.parent)
 
 
+@contextmanager
+def folder_of(file: Path) -> Iterator[None]:
+    """Make the folders above a file; those that hold nothing at the end go again."""
+    made = [folder for folder in file.parents if not folder.exists()]
+    try:
+        make_folders(file.parent)
+        yield
+    finally:
+        for folder in made:  # the innermost first
+            with suppress(OSError):  # it is not empty, or was never made
+                folder.rmdir()
+
+
 def is_bare(folder: Path) -> bool:
     """Whether a folder holds nothing, or what a killed process of ours left of itself."""
     return all(entry.name.startswith(TEMPORARY_PREFIX) for entry in folder.iterdir())

@@ -20,6 +20,10 @@ _AGAIN = 0.05
 class Terminated(BaseException):
     """SIGTERM or SIGHUP came. Not an Exception: nothing on the way may take it for a failure."""
 
+    def __init__(self, number: int = signal.SIGTERM) -> None:
+        super().__init__(number)
+        self.number = number
+
 
 @contextmanager
 def interruptible() -> Iterator[None]:
@@ -31,7 +35,7 @@ def interruptible() -> Iterator[None]:
     what is raised is the exception that came."""
 
     def interrupt(number: int, _frame: object) -> NoReturn:
-        raise KeyboardInterrupt if number == signal.SIGINT else Terminated
+        raise KeyboardInterrupt if number == signal.SIGINT else Terminated(number)
 
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     replaced = {number: old for number, old in before.items() if old is not signal.SIG_IGN}
@@ -68,11 +72,12 @@ def _coming_again() -> Iterator[None]:
     printed, ignored = sys.excepthook, sys.unraisablehook
     waiting: list[threading.Timer] = []
 
-    def again(kind: type[BaseException] | None) -> bool:
-        ends = {KeyboardInterrupt: signal.SIGINT, Terminated: signal.SIGTERM}
-        if kind not in ends:
+    def again(value: BaseException | None) -> bool:
+        if not isinstance(value, (KeyboardInterrupt, Terminated)):
             return False
-        later = threading.Timer(_AGAIN, _thread.interrupt_main, (ends[kind],))
+        # As the signal that it was: another may be ignored.
+        number = value.number if isinstance(value, Terminated) else signal.SIGINT
+        later = threading.Timer(_AGAIN, _thread.interrupt_main, (number,))
         later.daemon = True
         waiting.append(later)
         later.start()
@@ -81,11 +86,11 @@ def _coming_again() -> Iterator[None]:
     def excepthook(
         kind: type[BaseException], value: BaseException, trace: TracebackType | None
     ) -> None:
-        if not again(kind):
+        if not again(value):
             printed(kind, value, trace)
 
     def unraisablehook(told: sys.UnraisableHookArgs) -> None:
-        if not again(told.exc_type):
+        if not again(told.exc_value):
             ignored(told)
 
     sys.excepthook, sys.unraisablehook = excepthook, unraisablehook

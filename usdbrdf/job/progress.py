@@ -31,6 +31,12 @@ def fill_closed_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
 
 
+def keep_usd_off_stdout() -> None:
+    """Take TF_DEBUG away before USD is loaded: it prints what that asks for among our results, and
+    puts files into the current folder."""
+    os.environ.pop("TF_DEBUG", None)
+
+
 def set_quiet(quiet: bool) -> None:
     """Silence ``progress`` and ``say`` (the command line's -q)."""
     global _quiet

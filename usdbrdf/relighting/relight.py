@@ -173,14 +173,18 @@ def _check(options: RelightOptions, output: Path, asset: Asset) -> None:
 def _refuse_inputs(targets: Sequence[Path], asset: Asset, options: RelightOptions) -> None:
     """OwnershipConflict where a picture would replace a photograph of the capture, or what it is
     made from."""
-    given = [options.lights, *(insert.model for insert in options.inserts)]
-    inputs = {os.path.realpath(file) for file in given if file is not None}
-    inputs |= {os.path.realpath(photograph) for photograph in recorded_photographs(asset)}
+    inputs = {
+        os.path.realpath(file): "one of the capture's photographs and masks,"
+        for file in recorded_photographs(asset)
+    }
+    inputs |= {os.path.realpath(insert.model): "a model of --insert," for insert in options.inserts}
+    if options.lights is not None:
+        inputs[os.path.realpath(options.lights)] = "the file of --lights,"
     for target in targets:
-        if os.path.realpath(target) in inputs:
+        if (which := inputs.get(os.path.realpath(target))) is not None:
             raise OwnershipConflict(
-                f"{target}: this is a photograph of the capture, or another input, which stays as "
-                "it is. Name another place with -o. [relight.output]"
+                f"{target}: this is {which} which stays as it is. Name another place with -o. "
+                "[relight.output]"
             )
 
 
