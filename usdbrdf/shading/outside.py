@@ -304,6 +304,7 @@ def _with_lamps(
     """How the scan is asked for daylight and for what shines beside it, the numbers of the objects
     among these, and what it tells."""
     told = _told(look, asked, share)
+    of_daylight = look, np.zeros(0, np.int64), told
     # Lamps beside it would brighten the sky, and all the less the farther they are: as it is, it
     # does not explain them.
     beside = beside_daylight(
@@ -324,10 +325,7 @@ def _with_lamps(
         if shines.all():
             return look, beside.likely.object, told
         beside = beside.of(shines)
-    if look.lamps is not None:
-        look = look._replace(lamps=None)
-        told = _told(look, asked, share)
-    return look, np.zeros(0, np.int64), told
+    return of_daylight
 
 
 def _told(look: _Look, asked: Asked, share: Double) -> _Told:
