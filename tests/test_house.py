@@ -289,6 +289,7 @@ ENGINEERING: dict[str, str] = {
     "_MIN_FRAMED_SHARE": "limit of what is refused",
     "_MIN_HIT_SHARE": "limit of what is refused",
     "_MIN_USEFUL_SHARE": "limit of what is refused",
+    "_MIXED": "discretisation of a mean",
     "_MORE": "steps of a search",
     "_MOSTLY": "from here on a warning is printed",
     "_MOSTLY_CLEAR": "half: whether most are",

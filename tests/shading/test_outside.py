@@ -10,7 +10,7 @@ import pytest
 from tests.physics.surfaces import Sampling, box, quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.model.texels import CoverageMap
-from usdbrdf.shading import sky_patches
+from usdbrdf.shading import outside, sky_patches
 from usdbrdf.shading.outside import Outside, light_from_outside
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings
 from usdbrdf.shading.unseen_lamps import lamps_that_explain
@@ -141,7 +141,9 @@ def test_what_surfaces_mirror_is_not_taken_for_light_in_their_shadows(sunny):
     surface, lit, albedo = sunny
     # From everywhere the same light, next to which what shadows scatter is little.
     sheen = 0.04 * np.median(lit, axis=0)
-    sheen = np.pi * np.where(albedo.mean(axis=1) < 0.45, 1.0, 0.5)[:, None] * 3 * sheen
+    owner = surface.texels.object_index()
+    usual = np.bincount(owner, albedo.mean(axis=1)) / np.bincount(owner)
+    sheen = np.pi * np.where(usual < 0.45, 1.0, 0.5)[owner, None] * 8 * sheen
     every = np.ones(len(lit), np.bool_)
     shown = lit + (sheen / np.pi).astype(np.float32)
     seen = _seen(np.abs(_UP) < 0.3)
@@ -370,10 +372,9 @@ def test_the_ground_beyond_may_be_darker_than_the_sky_over_it(yard, monkeypatch)
     assert found < 0.5 * of_sky()
 
 
-@pytest.fixture(scope="module")
-def pergola():
-    """A yard of 6 m with walls on two sides, and slats of 42 cm above it."""
-    slats = [quad((0, y, 2.2), (6, 0, 0), (0, 0.42, 0), (24, 2)) for y in np.arange(0, 6, 0.84)]
+def _pergola(slat: float):
+    """A yard of 6 m with walls on two sides, and slats above it, as wide as the gaps between."""
+    slats = [quad((0, y, 2.2), (6, 0, 0), (0, slat, 0), (24, 2)) for y in np.arange(0, 6, 2 * slat)]
     return world_of([
         quad((0, 0, 0), (6, 0, 0), (0, 6, 0), (72, 72)),
         quad((0, 6, 0), (6, 0, 0), (0, 0, 2), (60, 20)),
@@ -383,8 +384,11 @@ def pergola():
     ])  # fmt: skip
 
 
-def test_stripes_of_shadow_that_pixels_blur_are_not_taken_for_light_around_the_sun(pergola):
-    surface, lit, _ = _lit(pergola, Environment(SKY, True).under(SUN), texture=0.05)
+def _under_stripes(slat: float) -> tuple[Outside, np.ndarray]:
+    """What is found where pixels blur the shadows of such slats, and how many times as bright as it
+    is the sky becomes around the sun, (3,)."""
+    world = _pergola(slat)
+    surface, lit, _ = _lit(world, Environment(SKY, True).under(SUN), texture=0.05)
     texels = surface.texels
     pixels = np.tile(np.float32([0.7, 0, 0.7]), (len(texels), 1))
     shown = blurred(texels, lit, pixels)
@@ -395,5 +399,20 @@ def test_stripes_of_shadow_that_pixels_blur_are_not_taken_for_light_around_the_s
     assert found is not None
     unseen = ~seen.coverage.measured.reshape(HEIGHT, WIDTH) & (_UP > 0)
     around = found.environment.image[unseen].mean(axis=0) / SKY[unseen].mean(axis=0)
+    return found, around
+
+
+def test_stripes_of_shadow_that_pixels_blur_are_not_taken_for_light_around_the_sun():
+    found, around = _under_stripes(0.42)
     assert (around < 2.5).all()
     np.testing.assert_allclose(found.environment.sun.irradiance, SUN.irradiance, rtol=0.15)
+
+
+def test_where_pixels_mix_all_stripes_of_shadow_their_means_tell_the_sun(monkeypatch):
+    monkeypatch.setattr(outside, "_clear_of_shadows", lambda *_: None)
+    found, _ = _under_stripes(0.21)
+    np.testing.assert_allclose(found.environment.sun.irradiance, SUN.irradiance, rtol=0.15)
+    # All texels by themselves tell half of it.
+    monkeypatch.setattr(outside, "_as_pixels_mix", lambda *_: None)
+    found, _ = _under_stripes(0.21)
+    assert (found.environment.sun.irradiance < 0.6 * SUN.irradiance).all()

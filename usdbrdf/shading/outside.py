@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -60,6 +61,8 @@ _FIRST_RAYS, _RAYS = 32, 1024
 # To be chosen from, and texels to the side of one that see, up to this difference of their cosine
 # to it, as much of the sun.
 _MANY_PER_SEGMENT, _AROUND, _AS_SUNLIT = 960, 2, 0.05
+# Texels from one to those over which what pixels mix is mixed as well.
+_MIXED = (-4, -2, 0, 2, 4)
 # What surfaces mirror follows from the light that was found before; then it is as it was told.
 _LOOKS_AT_MIRRORED, _AS_TOLD = 2, (1.0, 0.0)
 # Where more of the sunlit texels are clear of shadows than this, all of them tell more.
@@ -207,7 +210,7 @@ def light_from_outside(
         told = _beside_mirrored(look, told)
     error = jackknife(*told.with_sun, told.found)
     sun_shines = _sun_shines(told, error)
-    told, error = _clear_of_shadows(look, told, error) if sun_shines else _sunless(look, told)
+    told, error = _beside_blurred(look, told, error) if sun_shines else _sunless(look, told)
     found = levelled(*told.with_sun, told.found)
     sky, of_sky = np.exp(found.log_radiance[: len(look.used)]), error[: len(look.used)].max(axis=1)
     # By the light that each brings: nobody asks how dark dark ground is.
@@ -378,50 +381,78 @@ def _sunless(look: _Look, told: _Told) -> tuple[_Told, Double]:
     return told, jackknife(*without_sun, found)
 
 
-def _clear_of_shadows(look: _Look, told: _Told, error: Double) -> tuple[_Told, Double]:
-    """The same by texels that lie clear of shadows' edges, and the errors, (K, 3), if these tell
-    the sun well."""
-    many = asked_texels(look.surface.texels, look.lit, look.coverage, look.seed, _MANY_PER_SEGMENT)
+def _beside_blurred(look: _Look, told: _Told, error: Double) -> tuple[_Told, Double]:
+    """The same with the sun as it is told best where shadows are blurred, and the errors, (K, 3).
+
+    Pixels mix sunlight and shadow, most so in the stripes of blinds: what then is too bright in the
+    shadows passes for light from all around the sun, and what is too dark between them for a weak
+    one. Two ways around that: texels that lie clear of shadows' edges, where there are such; and
+    means over more than a pixel, which are those of what falls there, whatever it mixes."""
+    ways = [_clear_of_shadows(look, told, error), _as_pixels_mix(look, told)]
+    well = [way for way in ways if way and way[1][-1].max() < _MOST_CLEAR_ERROR]
+    return min(well, key=lambda way: float(way[1][-1].max()), default=(told, error))
+
+
+def _clear_of_shadows(look: _Look, told: _Told, error: Double) -> tuple[_Told, Double] | None:
+    """By texels around which all see as much of the sun, as many of each segment in its light as in
+    shadow where there are; as they are where most of those in the sun are such; None where too few
+    are."""
+    surface = look.surface
+    many = asked_texels(surface.texels, look.lit, look.coverage, look.seed, _MANY_PER_SEGMENT)
     assert many is not None
-    clear = _clearly_lit(look.surface, many, told.sun, look.seed)
-    if clear is None:
+    share, clear = sunlit(surface, many.texel, told.sun, look.seed), np.ones(len(many.texel), bool)
+    for beside in surface.texels.around(many.texel, _AROUND):
+        clear &= np.abs(sunlit(surface, beside, told.sun, look.seed) - share) < _AS_SUNLIT
+    if clear[share > 0].mean() > _MOSTLY_CLEAR:
         return told, error
-    clear, sources = look.at(clear, look.shares(clear)[0])
+    every = np.arange(int(many.segment.max()) + 1)
+    halves = [
+        first_of_segments(np.flatnonzero(clear & part), many.segment, every, PER_SEGMENT // 2)
+        for part in (share > 0, share <= 0)
+    ]
+    if len(halves[0]) < LEAST_OF_SEGMENT:
+        return None
+    some = many.of(np.sort(np.concatenate(halves)))
+    some, sources = look.at(some, look.shares(some)[0])
     if look.mirrored is not None:
-        clear = clear._replace(mirrored=look.mirrored(look.under_sun(told), clear.texel))
+        some = some._replace(mirrored=look.mirrored(look.under_sun(told), some.texel))
     # As those before told it.
     sources = told.sources._replace(share=sources.share)
-    by_clear = _solved(look, clear, sources, told.sun)
-    own_error = jackknife(*by_clear.with_sun, by_clear.found)
-    return (by_clear, own_error) if own_error[-1].max() < _MOST_CLEAR_ERROR else (told, error)
+    by_clear = _solved(look, some, sources, told.sun)
+    return by_clear, jackknife(*by_clear.with_sun, by_clear.found)
+
+
+def _as_pixels_mix(look: _Look, told: _Told) -> tuple[_Told, Double] | None:
+    """By the means over what lies around each of the texels asked, on the same wall; by those alone
+    around which no sun is; and by what clips as a bound. None where too few in the sun have a wall
+    around them."""
+    surface, asked = look.surface, told.asked
+    texels, centre, whole = surface.texels, asked.texel, ~asked.clipped
+    reflected, share = np.zeros_like(asked.reflected), np.zeros(len(centre))
+    sunny, width = np.zeros(len(centre), np.bool_), texels.resolution[asked.owner, 0]
+    for right, down in product(_MIXED, repeat=2):
+        beside = texels.beside(centre, right, down).astype(np.int64)
+        there = texels.pixel[beside] - texels.pixel[centre] == right + down * width
+        own = sunlit(surface, beside, told.sun, look.seed)
+        whole &= there & look.coverage.measured[beside]
+        sunny |= there & (own > 0)
+        reflected += np.pi * look.lit[beside] / len(_MIXED) ** 2
+        share += own / len(_MIXED) ** 2
+    if np.count_nonzero(whole & (share > 0)) < LEAST_OF_SEGMENT:
+        return None
+    share = np.where(whole, share, sunlit(surface, centre, told.sun, look.seed))
+    kept = whole | asked.clipped | ~sunny
+    mixed = asked._replace(reflected=np.where(whole[:, None], reflected, asked.reflected))
+    sources = _and_sun(told.sources, asked, share)
+    with_sun = mixed.of(kept), sources._replace(share=sources.share[:, kept])
+    found = solved(*with_sun)
+    return told._replace(with_sun=with_sun, found=found), jackknife(*with_sun, found)
 
 
 def _of_measured(seen: Surroundings, z_up: bool) -> Environment:
     """What frames measured, and no light from elsewhere."""
     known = np.where(seen.coverage.measured[:, None], seen.radiance, np.float32(0))
     return Environment(known.reshape(HEIGHT, WIDTH, 3), z_up)
-
-
-def _clearly_lit(surface: TexturedScene, asked: Asked, sun: Sun, seed: int) -> Asked | None:
-    """Of the texels asked those around which all see as much of the sun, as many of each segment in
-    its light as in shadow where there are; None if hardly one is in the sun, or most of those are
-    such already.
-
-    Pixels mix sunlight and shadow, most so in the stripes of blinds: what then is too bright in the
-    shadows passes for light from all around the sun."""
-    share, clear = sunlit(surface, asked.texel, sun, seed), np.ones(len(asked.texel), np.bool_)
-    for beside in surface.texels.around(asked.texel, _AROUND):
-        clear &= np.abs(sunlit(surface, beside, sun, seed) - share) < _AS_SUNLIT
-    if clear[share > 0].mean() > _MOSTLY_CLEAR:
-        return None
-    every = np.arange(int(asked.segment.max()) + 1)
-    halves = [
-        first_of_segments(np.flatnonzero(clear & part), asked.segment, every, PER_SEGMENT // 2)
-        for part in (share > 0, share <= 0)
-    ]
-    if len(halves[0]) < LEAST_OF_SEGMENT:
-        return None
-    return asked.of(np.sort(np.concatenate(halves)))
 
 
 _SUN_DEVIATION = calibration.number("outside.sun_deviation")
@@ -438,9 +469,15 @@ def _with_sun(
     share = sunlit(surface, asked.texel, sun, seed).astype(np.float64)
     cosine = np.maximum(surface.texels.normal[asked.texel] @ sun.direction, 0)
     kept = (share < 0.02 * cosine + 1e-6) | (share > 0.98 * cosine)
+    sources = _and_sun(sky, asked, share)
+    return asked.of(kept), sources._replace(share=sources.share[:, kept])
+
+
+def _and_sun(sky: Sources, asked: Asked, share: Double) -> Sources:
+    """The sources with the sun as the last, which brings ``share`` (N,) to the texels asked."""
     strength = np.log(np.median(asked.irradiance + sky.irradiance(sky.mean), axis=0))
-    sources = Sources(
-        share=np.concatenate([sky.share, share[None]])[:, kept],
+    return Sources(
+        share=np.concatenate([sky.share, share[None]]),
         mean=np.concatenate([sky.mean, strength[None]]),
         deviation=np.append(sky.deviation, _SUN_DEVIATION),
         family=np.append(sky.family, 0),
@@ -448,4 +485,3 @@ def _with_sun(
         apart=sky.apart,
         gloss=sky.gloss,
     )
-    return asked.of(kept), sources
