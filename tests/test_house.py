@@ -387,6 +387,7 @@ ENGINEERING: dict[str, str] = {
     "_TRIED": "steps of a search",
     "_TURNS": "steps of a search",
     "_UNDECIDED": "codes of 8-bit images",
+    "_UNEVEN": "from here on a warning is printed",
     "_UNPLACED": "mathematics: nothing moves",
     "_UPDATES": "steps of a search",
     "_UPPER": "mathematics: the normal distribution",
