@@ -192,6 +192,7 @@ ENGINEERING: dict[str, str] = {
     "_AS_SUNLIT": "numerics: the same share of the sun by other rays",
     "_AS_TOLD": "definition",
     "_AT_A_TIME": "memory",
+    "_AT_CORNER": "limit of what is refused",
     "_AXES": "convention of a format",
     "_BANDS": "discretisation of the sky",
     "_BATCH": "memory",
