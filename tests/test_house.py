@@ -357,6 +357,8 @@ ENGINEERING: dict[str, str] = {
     "_ROUNDS": "steps of a search",
     "_ROWS": "memory",
     "_RUN": "time",
+    "_SAME_CAMERA": "limit of what is believed",
+    "_SAME_FRAME": "numerics: of float64",
     "_SAVED_UPRIGHT": "EXIF's numbers",
     "_SEED": "a seed",
     "_SEED_OF_DOUBT": "random numbers of their own",

@@ -485,3 +485,13 @@ def test_of_several_folders_that_with_most_images_is_taken(splats):
     scan = read_scan(splats.folder, OPTIONS)
     assert _taken(scan) == {"pics"}
     assert any("from pics/, the folder that holds most of them" in s for s in scan.warnings)
+
+
+def test_the_only_mesh_beside_the_model_is_taken(tmp_path):
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    (made.folder / "mesh.ply").rename(made.folder / "scan of the room.ply")
+    scan = read_scan(made.folder, OPTIONS)
+    assert len(scan.mesh.points) == len(made.points)
+    (made.folder / "scan of the room.ply").rename(made.folder / "room.stl")
+    with pytest.raises(InputRefused, match=r"no mesh that is read \(room\.stl .*poisson_mesher"):
+        read_scan(made.folder, OPTIONS)
