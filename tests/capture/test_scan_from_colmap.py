@@ -198,9 +198,12 @@ def test_the_distorted_model_goes_with_distorted_images(tmp_path):
     assert {view.photograph.parent for view in scan.views} == {made.folder / "images"}
 
 
-def test_without_distorted_images_the_undistorted_model_is_taken(tmp_path):
-    made = colmap_capture(tmp_path / "room")
-    dense = undistorted_beside(made)
+@pytest.mark.parametrize("place", ["dense", "colmap_dense"])
+def test_without_distorted_images_the_undistorted_model_is_taken(tmp_path, place):
+    """The second is what those have who follow instant-ngp, beside colmap_sparse."""
+    sparse = "sparse/0" if place == "dense" else "colmap_sparse/0"
+    made = colmap_capture(tmp_path / "room", sparse=sparse)
+    dense = undistorted_beside(made).rename(made.folder / place)
     shutil.rmtree(made.folder / "images")
     scan = read_scan(made.folder, OPTIONS)
     assert scan.views == ()

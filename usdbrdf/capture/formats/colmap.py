@@ -50,7 +50,7 @@ NAME = "colmap"
 DESCRIPTION = DESCRIPTIONS[NAME]
 # Workspaces below the capture, as COLMAP and those who follow it lay them out; where the model lies
 # in a workspace; and where its images do.
-_WORKSPACES = ("", "dense", "dense/0", "undistorted", "colmap", "distorted")
+_WORKSPACES = ("", "dense", "dense/0", "colmap_dense", "undistorted", "colmap", "distorted")
 _MODELS = ("", "sparse/0", "sparse", "colmap_sparse/0", "colmap_text")
 _IMAGES = ("images", "input", "", "images_2", "images_4", "images_8")
 # What scaled-down copies of images are in.
