@@ -325,13 +325,38 @@ def test_what_is_not_read_is_refused(tmp_path, old, new, said):
         read_scan(tmp_path, OPTIONS)
 
 
-def test_a_model_in_tiles_or_of_another_system_is_refused(tmp_path):
+def test_a_model_in_tiles_is_one(tmp_path):
+    """Each is a piece of it, and its materials are those of the piece."""
     room = truth().square()
     _write(tmp_path, room, _document(room), "Data/Tile_0/Tile_0.obj")
-    (tmp_path / "Data/Tile_1").mkdir()
-    write_obj(tmp_path / "Data/Tile_1/Tile_1.obj", room)
-    with pytest.raises(InputRefused, match="Its model is in 2 tiles: produce it without tiling"):
+    (tmp_path / "Data/Tile_0/Tile_0.obj").unlink()
+    left = room.points[room.triangles][:, :, 0].mean(axis=1) < room.points[:, 0].mean()
+    for i, of in enumerate((left, ~left)):
+        used, corners = np.unique(room.triangles[of], return_inverse=True)
+        piece = dataclasses.replace(
+            room,
+            points=room.points[used],
+            triangles=corners.reshape(-1, 3),
+            face_object=room.face_object[of],
+        )
+        (tmp_path / f"Data/Tile_{i}").mkdir(exist_ok=True)
+        write_obj(tmp_path / f"Data/Tile_{i}/Tile_{i}.obj", piece)
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, room)
+    assert any("2 tiles, first Data/Tile_0/Tile_0.obj. [mesh.tiles]" in w for w in scan.warnings)
+    assert not {each.label for each in scan.objects} & set(room.names)
+    write_obj(tmp_path / "Data/Tile_1/Tile_1_L19.obj", room)
+    with pytest.raises(InputRefused, match=r"have levels of detail\. Produce it without these"):
         read_scan(tmp_path, OPTIONS)
+    write_obj(tmp_path / "whole.obj", room)
+    assert_same(
+        read_scan(tmp_path, dataclasses.replace(OPTIONS, mesh=tmp_path / "whole.obj")), room
+    )
+
+
+def test_a_model_of_another_system_is_refused(tmp_path):
+    room = truth().square()
+    _write(tmp_path, room, _document(room))
     for text, said in (
         (
             "<SRS>EPSG:32617</SRS>",

@@ -92,12 +92,21 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         source=source,
         folder=source.parent,
         meshes=("mesh.*", "model.*", *(["Data/*/*.obj"] if len(tiles) == 1 else [])),
-        how=f"Its model is in {len(tiles)} tiles: produce it without tiling"
-        if len(tiles) > 1
-        else "Put the model that was made in this block's coordinate system into this folder, with "
+        tiles=() if options.mesh else _refined_once(tiles, source),
+        how="Put the model that was made in this block's coordinate system into this folder, with "
         f"{_METADATA} of its production",
         in_metres=bool(system),
     )
+
+
+def _refined_once(tiles: list[Path], source: Path) -> list[Path]:
+    """The files of a model, one of each tile; InputRefused where these have levels of detail."""
+    if len({tile.parent for tile in tiles}) < len(tiles):
+        raise InputRefused(
+            f"{source}: the tiles of its model in Data/ have levels of detail. Produce it without "
+            "these, or name one mesh of the whole with --mesh. [mesh.missing]"
+        )
+    return tiles
 
 
 def beside_mesh(mesh: Path) -> list[Path]:

@@ -4,10 +4,9 @@ camera and a pose by numbers, pictures lie in some folder, and a mesh that was e
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,6 +22,7 @@ from usdbrdf.capture.formats.named_pictures import (
     warn_of_radiance,
     warn_of_unused,
 )
+from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
@@ -30,7 +30,9 @@ from usdbrdf.files.tables import numbers_among
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Lens
+from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
+from usdbrdf.untrusted.mesh_files import mesh_of_tiles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +132,7 @@ def scan_of_shots(
     pictures_in: tuple[str, ...] = (),
     meshes: tuple[str, ...],
     how: str,
+    tiles: Sequence[Path] = (),
     up_axis: str | None = None,
     in_metres: bool = False,
     rim: bool = False,
@@ -140,6 +143,7 @@ def scan_of_shots(
     pictures_in     where the pictures lie below it, "" for there; empty: where most programs have
                     them
     meshes, how     patterns of the program's own names, and what to do where there is no mesh
+    tiles           files of one mesh, which is taken of them where no other is there
     up_axis         None where the format does not say
     rim             what is black along the pictures' borders is no part of them
     in_metres       False where the unit is that of the reconstruction, which nobody knows
@@ -194,9 +198,27 @@ def scan_of_shots(
             f"{lacking[0]!r}, so those pictures are looked at whole. Put them into a folder masks. "
             "[capture.mask]"
         )
+
+    def geometry() -> Path | ScanGeometry:
+        whole = any(next(folder.glob(pattern), None) for pattern in meshes)
+        if options.mesh is not None or whole or not tiles:
+            return mesh_beside(folder, options, *meshes, how=how)
+        findings.warn(
+            f"{source.name}: the mesh is that of {len(tiles)} tiles, first "
+            f"{tiles[0].relative_to(folder).as_posix()}. [mesh.tiles]"
+        )
+        return geometry_from_file(
+            tiles[0],
+            options.objects,
+            options,
+            findings,
+            capture_root=folder,
+            read=lambda _: mesh_of_tiles(tiles),
+        )
+
     return scan_of(
         records,
-        partial(mesh_beside, folder, options, *meshes, how=how),
+        geometry,
         options,
         findings,
         adapter=adapter,
