@@ -11,6 +11,7 @@ import pytest
 
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.files.colour import encoding_of_tag
 from usdbrdf.files.frames import PHOTOGRAPH_SATURATION, read_frame
 from usdbrdf.files.images import read_radiance
 from usdbrdf.options import IngestOptions
@@ -112,6 +113,22 @@ def test_photographs_have_the_space_of_the_profile_in_them(capture, profile, enc
     told = [sentence for sentence in scan.warnings if "[capture.encoding]" in sentence]
     assert len(told) == (profile != "sRGB IEC61966-2.1")
     assert all((encoding if encoding != "srgb_rec709_scene" else profile) in one for one in told)
+
+
+@pytest.mark.parametrize(
+    ("profile", "encoding"),
+    [
+        ("sRGB", "srgb_rec709_scene"),  # of Android
+        ("GIMP built-in sRGB", "srgb_rec709_scene"),
+        ("sRGB2014", "srgb_rec709_scene"),
+        ("Artifex Software sRGB ICC Profile", "srgb_rec709_scene"),
+        ("GIMP built-in Linear sRGB", None),
+        ("sRGB-elle-V2-g10.icc", None),
+        ("Adobe RGB (1998)", None),
+    ],
+)
+def test_profiles_are_known_by_any_of_their_names(profile, encoding):
+    assert encoding_of_tag(profile, ()) == encoding
 
 
 def test_colours_of_photographs_beyond_rec709_are_known(capture, tmp_path):

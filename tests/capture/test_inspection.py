@@ -30,6 +30,14 @@ def _as_photographs(capture: MadeCapture) -> None:
             write_preview_png(capture.folder / frame["file_path"], image)
 
 
+def test_frames_of_photographs_through_a_lens_count_as_what_these_are(capture):
+    _as_photographs(capture)
+    with edited(capture.manifest) as document:
+        document |= {"camera_model": "OPENCV", "k1": -0.05}
+    told = inspect(capture.folder, InspectOptions(assume_srgb=True)).summary()
+    assert told["frames"]["files"] == {".png": 12}
+
+
 def test_it_tells_what_was_written(capture):
     before = sorted(capture.folder.rglob("*"))
     found = inspect(capture.folder, InspectOptions())

@@ -11,6 +11,7 @@ import pytest
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
+from tests.capture.test_scan_from_colmap import pycolmap, reconstruction, write_model
 from tests.scenes import edited, make_capture, write_ply
 from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
 from usdbrdf.errors import InputRefused
@@ -135,7 +136,7 @@ def test_a_statement_that_says_no_frame_is_refused(capture, stated):
         read_scan(capture.folder, IngestOptions())
 
 
-def test_a_usd_mesh_is_read_as_it_lies_and_says_so(capture):
+def test_a_usd_mesh_in_the_frame_of_the_training_is_refused(capture):
     """USD states its own unit and axes, in which nobody exports from nerfstudio."""
     mesh = _train(capture, name="poisson_mesh.ply")
     stage = Usd.Stage.CreateNew(str(capture.folder / "mesh.usda"))
@@ -149,10 +150,58 @@ def test_a_usd_mesh_is_read_as_it_lies_and_says_so(capture):
     stage.Save()
     mesh.unlink()
     (capture.folder / "objects.json").unlink()
-    scan = read_scan(capture.folder, IngestOptions(mesh=capture.folder / "mesh.usda"))
+    options = IngestOptions(mesh=capture.folder / "mesh.usda")
+    with pytest.raises(InputRefused, match=r"USD files are not brought back\. .*\[mesh\.frame\]$"):
+        read_scan(capture.folder, options)
+    (capture.folder / "dataparser_transforms.json").unlink()
+    scan = read_scan(capture.folder, options)
     np.testing.assert_allclose(np.ptp(scan.mesh.points, axis=0), np.ptp(capture.points, axis=0))
-    (said,) = (sentence for sentence in scan.warnings if "[mesh.frame]" in sentence)
-    assert "mesh.usda: is read as it lies; dataparser_transforms.json beside it" in said
+
+
+def _recentred(made, folder, *, similarity):
+    """COLMAP's model of a capture in ``folder``, and its document as colmap2nerf.py leaves it:
+    the world turned, moved and scaled, and no word of that."""
+    names = [f"{i:04d}.exr" for i in range(len(made.world_from_camera))]
+    camera = pycolmap.Camera(model="PINHOLE", width=32, height=24, params=[24.0, 24, 16, 12])
+    model = reconstruction(made, [camera], names)
+    write_model(made.folder / folder, model, text="text" in folder)
+    scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
+    with edited(made.manifest) as document:
+        for frame in document["frames"]:
+            pose = similarity @ np.array(frame["transform_matrix"])
+            pose[:3, :3] /= scale
+            frame["transform_matrix"] = pose.tolist()
+
+
+def test_colmaps_mesh_is_brought_to_poses_that_instant_ngp_moved(capture):
+    folder = "colmap_sparse/0"
+    similarity = np.eye(4)
+    similarity[:3, :3] = 0.4 * Rotation.from_euler("xyz", [70, 10, -50], degrees=True).as_matrix()
+    similarity[:3, 3] = 0.3, -0.2, 0.5
+    _recentred(capture, folder, similarity=similarity)
+    expected = capture.points @ similarity[:3, :3].T + similarity[:3, 3]
+    mesh = capture.folder / "mesh.ply"
+    (capture.folder / "objects.json").unlink()
+    # Of one that is called otherwise nobody knows, and poses inside of it hit it anyhow.
+    told = read_scan(capture.folder, IngestOptions()).warnings
+    assert any("--adapter colmap. [mesh.frame]" in said for said in told)
+    mesh.rename(capture.folder / "meshed-poisson.ply")
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, expected, atol=1e-5)
+    assert any(f"the frame of its model {folder}; it is brought" in said for said in scan.warnings)
+    scan = read_scan(capture.folder, IngestOptions(), "colmap")
+    np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-5)
+
+
+def test_colmaps_mesh_stays_where_the_poses_are_its_models(capture):
+    _recentred(capture, "colmap_text", similarity=np.eye(4))
+    (capture.folder / "mesh.ply").rename(capture.folder / "meshed-poisson.ply")
+    scan = read_scan(capture.folder, IngestOptions())
+    assert scan.mesh.points.tobytes() == capture.points.tobytes()
+    assert not any("[mesh.frame]" in said for said in scan.warnings)
+    (capture.folder / "colmap_text/images.txt").write_text("1 0 cut off")
+    scan = read_scan(capture.folder, IngestOptions())
+    assert any("as its model was not read" in said for said in scan.warnings)
 
 
 def test_the_points_that_nerfstudio_begins_from_are_no_mesh(capture):

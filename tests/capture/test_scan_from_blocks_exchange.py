@@ -3,6 +3,8 @@ annotated sample of Paris."""
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -173,6 +175,107 @@ def test_distortions_are_those_of_the_format(tmp_path):
     assert_bends(shots[0].camera, room, _brown, terms)
 
 
+def _fisheye_pixels(points, pose, matrix, terms, centre):
+    """As Pix4D's manual writes its fisheye, and ContextCapture's with p4: the angle in parts of a
+    quarter of a turn, a polynomial of it, a matrix."""
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    across = np.linalg.norm(local[:, :2], axis=1)
+    theta = 2 / np.pi * np.arctan2(across, local[:, 2])
+    rho = sum(p * theta ** (i + 1) for i, p in enumerate(terms))
+    return (local[:, :2] * (rho / across)[:, None]) @ np.transpose(matrix) + centre
+
+
+@pytest.mark.parametrize(
+    ("matrix", "terms"),
+    [
+        ([[30.0, 0], [0, 30]], (1.0,)),
+        ([[31.0, 0], [0, 30]], (0.9, 0.05, -0.03, 0.01)),
+        ([[31.0, 0.4], [-0.3, 30.5]], (1.0, 0.05, -0.03)),
+        (None, (1.0, -0.04, 0.02)),
+    ],
+)
+def test_fisheyes(tmp_path, matrix, terms):
+    """Also such as are turned and skewed by their matrix, or have a focal length alone."""
+    room = truth().square()
+    fx, _, cx, cy = room.intrinsics[0].tolist()
+    said = "".join(f"<P{i + 1}>{p}</P{i + 1}>" for i, p in enumerate(terms))
+    said = f"<FisheyeDistortion><P0>0</P0>{said}</FisheyeDistortion>"
+    if matrix is not None:
+        entries = (f"<M_{i}{k}>{matrix[i][k]}</M_{i}{k}>" for i in (0, 1) for k in (0, 1))
+        said += f"<FisheyeFocalMatrix>{''.join(entries)}</FisheyeFocalMatrix>"
+    document = _document(room, axes="XRightYUp", extra=said).replace("Perspective", "Fisheye")
+    matrix = np.eye(2) * fx * np.pi / 2 if matrix is None else matrix
+    around = np.random.default_rng(0).normal(size=(500, 3))
+    for shot, pose in zip(_shots(tmp_path, document), room.opencv, strict=True):
+        points = pose[:3, 3] + around
+        expected = _fisheye_pixels(points, pose, matrix, terms, (cx, cy))
+        local = (points - shot.world_from_camera[:3, 3]) @ shot.world_from_camera[:3, :3]
+        found = shot.camera.lens.project(local * (1, -1, -1), shot.camera.intrinsics)
+        front = (around @ pose[:3, :3])[:, 2] > 0.1
+        np.testing.assert_allclose(found[front], expected[front], atol=1e-9)
+
+
+def test_a_room_through_a_fisheye(tmp_path):
+    """Pictures that fisheyes took become frames whose lines are straight."""
+    room = truth().square()
+    _write(tmp_path, room, _document(room).replace("Perspective", "Fisheye"))
+    scan = read_scan(tmp_path, OPTIONS)
+    assert len(scan.frames) == 10
+    assert scan.views[0].lens.curve == "fisheye"
+
+
+def test_pixels_that_are_not_square_are_told(tmp_path):
+    room = truth().square()
+    intrinsics = room.intrinsics * (1, 0.98, 1, 1)
+    wide = dataclasses.replace(room, intrinsics=intrinsics)
+    _write(tmp_path, room, _document(room).replace("Ratio>1<", "Ratio>0.98<"))
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, wide)
+    assert any("pixels that are not square; AspectRatio" in said for said in scan.warnings)
+
+
+def test_several_groups_of_photographs(tmp_path):
+    """As of two cameras; what one of them lacks does not concern the other."""
+    room = truth().square()
+    document = _document(room)
+    head = document[document.index("<Photogroup>") : document.index("<Photo>")]
+    parts = document.split("<Photo>")
+    parts[5] += f"</Photogroup>{head.replace('<Skew>0</Skew>', '')}"
+    _write(tmp_path, room, "<Photo>".join(parts))
+    assert_same(read_scan(tmp_path, OPTIONS), room)
+
+
+@pytest.mark.parametrize(
+    ("stated", "lies"),
+    [
+        ("D:/Work/masks/{}_msk.png", "masks/{}_msk.png"),
+        ("{}_mask.png", "images/{}_mask.png"),
+        ("D:\\Work\\sky\\{}.png", "sky/{}.png"),
+    ],
+)
+def test_masks_that_the_block_names_are_used(tmp_path, stated, lies):
+    room = truth().square()
+    parts = _document(room).split("</ImagePath>")
+    for i in range(3):
+        parts[i + 1] = f"<MaskPath>{stated.format(f'{i:04d}')}</MaskPath>{parts[i + 1]}"
+        if i:
+            mask = np.ones_like(room.images[i])
+            mask[: HEIGHT // 2] = 0
+            write_image(tmp_path / lies.format(f"{i:04d}"), mask)
+    _write(tmp_path, room, "</ImagePath>".join(parts))
+    scan = read_scan(tmp_path, OPTIONS)
+    assert [view and view.mask for view in scan.views][:4] == [
+        None,
+        *(tmp_path / lies.format(f"{i:04d}") for i in (1, 2)),
+        None,
+    ]
+    missing = stated.format("0000")
+    assert any(
+        f"1 of the masks that it names are not there, first {missing!r}" in w for w in scan.warnings
+    )
+    assert not any("[capture.unused]" in said for said in scan.warnings)
+
+
 def test_spheres(tmp_path):
     document = _document(truth()).replace(">Perspective<", ">Spherical<")
     camera = _shots(tmp_path, document)[0].camera
@@ -193,8 +296,14 @@ def test_photographs_that_were_not_placed_are_left_out(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        (">Perspective<", ">Fisheye<", "cameras of the type 'Fisheye' are not read"),
-        ("<Skew>0<", "<Skew>0.5<", "cameras with AspectRatio or Skew are not read"),
+        (">Perspective<", ">Tunnel<", "cameras of the type 'Tunnel' are not read"),
+        ("<Skew>0<", "<Skew>0.5<", "cameras with Skew are not read"),
+        (
+            ">Perspective</CameraModelType>",
+            ">Fisheye</CameraModelType><FisheyeDistortion><P0>0.1</P0></FisheyeDistortion>",
+            "P0 of FisheyeDistortion is 0.1, which leaves a hole",
+        ),
+        ("M_00>", "Yaw>", "its rotations are headings, pitches and rolls"),
         ("<SRSId>2<", "<SRSId>0<", r"its coordinates are longitudes .*\(EPSG:4326"),
         (f">{ENU}<", ">WGS84<", "its coordinates are longitudes and latitudes"),
         ("<Rotation>", "<Rot>", "not valid XML"),
@@ -202,6 +311,11 @@ def test_photographs_that_were_not_placed_are_left_out(tmp_path):
         ("<BlocksExchange", "<!DOCTYPE a><BlocksExchange", "an XML document with a document type"),
         ("XRightYDown", "XRightYLeft", "only 0 of 10 frames can be used"),
         ("FocalLengthPixels>", "Focal>", "only 0 of 10 frames can be used"),
+        (
+            ">Perspective</CameraModelType>",
+            ">Fisheye</CameraModelType><FisheyeDistortion><P1>-1</P1></FisheyeDistortion>",
+            "only 0 of 10 frames can be used",
+        ),
     ],
 )
 def test_what_is_not_read_is_refused(tmp_path, old, new, said):
@@ -211,13 +325,38 @@ def test_what_is_not_read_is_refused(tmp_path, old, new, said):
         read_scan(tmp_path, OPTIONS)
 
 
-def test_a_model_in_tiles_or_of_another_system_is_refused(tmp_path):
+def test_a_model_in_tiles_is_one(tmp_path):
+    """Each is a piece of it, and its materials are those of the piece."""
     room = truth().square()
     _write(tmp_path, room, _document(room), "Data/Tile_0/Tile_0.obj")
-    (tmp_path / "Data/Tile_1").mkdir()
-    write_obj(tmp_path / "Data/Tile_1/Tile_1.obj", room)
-    with pytest.raises(InputRefused, match="Its model is in 2 tiles: produce it without tiling"):
+    (tmp_path / "Data/Tile_0/Tile_0.obj").unlink()
+    left = room.points[room.triangles][:, :, 0].mean(axis=1) < room.points[:, 0].mean()
+    for i, of in enumerate((left, ~left)):
+        used, corners = np.unique(room.triangles[of], return_inverse=True)
+        piece = dataclasses.replace(
+            room,
+            points=room.points[used],
+            triangles=corners.reshape(-1, 3),
+            face_object=room.face_object[of],
+        )
+        (tmp_path / f"Data/Tile_{i}").mkdir(exist_ok=True)
+        write_obj(tmp_path / f"Data/Tile_{i}/Tile_{i}.obj", piece)
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, room)
+    assert any("2 tiles, first Data/Tile_0/Tile_0.obj. [mesh.tiles]" in w for w in scan.warnings)
+    assert not {each.label for each in scan.objects} & set(room.names)
+    write_obj(tmp_path / "Data/Tile_1/Tile_1_L19.obj", room)
+    with pytest.raises(InputRefused, match=r"have levels of detail\. Produce it without these"):
         read_scan(tmp_path, OPTIONS)
+    write_obj(tmp_path / "whole.obj", room)
+    assert_same(
+        read_scan(tmp_path, dataclasses.replace(OPTIONS, mesh=tmp_path / "whole.obj")), room
+    )
+
+
+def test_a_model_of_another_system_is_refused(tmp_path):
+    room = truth().square()
+    _write(tmp_path, room, _document(room))
     for text, said in (
         (
             "<SRS>EPSG:32617</SRS>",

@@ -198,9 +198,12 @@ def test_the_distorted_model_goes_with_distorted_images(tmp_path):
     assert {view.photograph.parent for view in scan.views} == {made.folder / "images"}
 
 
-def test_without_distorted_images_the_undistorted_model_is_taken(tmp_path):
-    made = colmap_capture(tmp_path / "room")
-    dense = undistorted_beside(made)
+@pytest.mark.parametrize("place", ["dense", "colmap_dense"])
+def test_without_distorted_images_the_undistorted_model_is_taken(tmp_path, place):
+    """The second is what those have who follow instant-ngp, beside colmap_sparse."""
+    sparse = "sparse/0" if place == "dense" else "colmap_sparse/0"
+    made = colmap_capture(tmp_path / "room", sparse=sparse)
+    dense = undistorted_beside(made).rename(made.folder / place)
     shutil.rmtree(made.folder / "images")
     scan = read_scan(made.folder, OPTIONS)
     assert scan.views == ()
@@ -485,3 +488,13 @@ def test_of_several_folders_that_with_most_images_is_taken(splats):
     scan = read_scan(splats.folder, OPTIONS)
     assert _taken(scan) == {"pics"}
     assert any("from pics/, the folder that holds most of them" in s for s in scan.warnings)
+
+
+def test_the_only_mesh_beside_the_model_is_taken(tmp_path):
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    (made.folder / "mesh.ply").rename(made.folder / "scan of the room.ply")
+    scan = read_scan(made.folder, OPTIONS)
+    assert len(scan.mesh.points) == len(made.points)
+    (made.folder / "scan of the room.ply").rename(made.folder / "room.stl")
+    with pytest.raises(InputRefused, match=r"no mesh that is read \(room\.stl .*poisson_mesher"):
+        read_scan(made.folder, OPTIONS)

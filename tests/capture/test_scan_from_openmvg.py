@@ -3,8 +3,10 @@ of views, poses and cameras): a class's name stands with its first object alone.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
+import numpy as np
 import pytest
 
 from tests.format_truth import (
@@ -81,6 +83,23 @@ def test_pictures_that_were_not_placed_are_left_out(tmp_path):
     document["views"][5]["value"]["ptr_wrapper"]["data"]["id_pose"] = {}
     _write(tmp_path, room, document)
     assert len(read_scan(tmp_path, OPTIONS).frames) == 8
+
+
+@pytest.mark.parametrize(
+    ("folder", "width"), [("undistorted_images", 4), ("undistorted_images", 0), ("images", 4)]
+)
+def test_the_black_rim_of_undistorted_pictures_is_left_out(tmp_path, folder, width):
+    """As openMVG_main_ExportUndistortedImages leaves it; of others nobody knows what is black."""
+    room = truth().square()
+    images = [np.maximum(image, 0.02) for image in room.images]
+    for image in images[::4]:
+        image[:, :width] = image[:width] = 0
+    _write(tmp_path, dataclasses.replace(room, images=images), _document(room))
+    (tmp_path / "images").rename(tmp_path / folder)
+    scan = read_scan(tmp_path, dataclasses.replace(OPTIONS, frames=tmp_path / folder))
+    found = folder != "images" and width > 0
+    assert any("black along their borders" in said for said in scan.warnings) == found
+    assert any(view is not None and view.rim for view in scan.views) == found
 
 
 @pytest.mark.parametrize(

@@ -190,6 +190,21 @@ def write_sidecars(folder, room, *, as_attributes):
     return folder
 
 
+@pytest.mark.parametrize("bent", ["", "0 0 0 0 0 0", "-0.1 0 0 0 0 0"])
+def test_a_division_without_terms_is_a_pinhole(tmp_path, room, bent):
+    """As those write it who cut panoramas into pictures."""
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)
+    write_obj(folder / "model.obj", room)
+    for file in folder.rglob("*.xmp"):
+        text = file.read_text().replace("brown3", "division")
+        file.write_text(text.replace(">0 0 0 0 0 0<", f">{bent}<"))
+    if "1" in bent:
+        with pytest.raises(InputRefused, match=r"the lens model 'division' is not read"):
+            read_scan(folder, OPTIONS)
+    else:
+        assert_same(read_scan(folder, OPTIONS), room)
+
+
 def test_the_lens_is_a_polynomial_of_the_ray(tmp_path, room):
     folder = write_pictures(tmp_path / "scan", room)
     write_table(folder, room, bent="-0.1,0.06,-0.01,0.002,0.003,0.004")

@@ -253,3 +253,20 @@ def test_names_of_any_kind_pass_through_the_whole_reader(tmp_path):
     assert len(set(identifiers)) == 5
     assert all(name.isidentifier() and name.isascii() for name in identifiers)
     assert [o.label for o in scan.objects][:3] == ["椅子", "../x", "object_2"]
+
+
+@pytest.mark.parametrize("tiles", [True, False])
+def test_pictures_may_be_cut_out_of_larger_ones(tmp_path, tiles):
+    """The axis of such lies outside of them, or in the corner of some; in that of all it is an
+    offset from the middle."""
+    made = make_capture(tmp_path)
+    with edited(made.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            frame["cx"], frame["cy"] = (-5, 12) if tiles and i else (2, 1)
+    if not tiles:
+        with pytest.raises(InputRefused, match=r"not from its middle.*\[capture\.camera\]$"):
+            read_scan(made.folder, IngestOptions())
+        return
+    scan = read_scan(made.folder, IngestOptions())
+    assert len(scan.frames) == len(document["frames"])
+    assert any("lie outside of their images, as of crops alone" in said for said in scan.warnings)

@@ -314,6 +314,11 @@ REFUSED: dict[str, tuple[Recipe, str, list[str]]] = {
         "capture.camera",
         ["frames/0000.exr", "not from its middle"],
     ),
+    "principal point pixels from the middle": (
+        _manifest(lambda d: d.update(cx=3, cy=-2)),
+        "capture.camera",
+        ["frames/0000.exr", "not from its middle"],
+    ),
     "distortion that turns back": (
         _manifest(lambda d: d.update(k1=-20)),
         "capture.camera",
@@ -436,7 +441,9 @@ def test_the_capture_is_good_without_a_fault(capture):
 @pytest.mark.fault("C12", "distortion that moves aside", "panorama of another shape")
 @pytest.mark.fault("C12", "distortion that stretches", "intrinsics in parts of the picture")
 @pytest.mark.fault("C12", "focal length in mm", "principal point in parts of the picture")
-@pytest.mark.fault("C12", "principal point from the middle")
+@pytest.mark.fault(
+    "C12", "principal point from the middle", "principal point pixels from the middle"
+)
 @pytest.mark.fault("C13", "not json", "deep json", "duplicate key")
 @pytest.mark.fault("G1", "missing mesh", "empty mesh")
 @pytest.mark.fault("G2", "nan vertices", "face index out of range", "negative face index")

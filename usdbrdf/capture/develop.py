@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from usdbrdf.capture.checks import FrameRecord
+from usdbrdf.capture.checks import PHOTOGRAPH_SUFFIXES, Findings, FrameRecord, spread_evenly
 from usdbrdf.capture.lens_views import Intrinsics, PinholeView, Size, shows_any, views_of
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.colour import kind_of_encoding, linear_space_of
 from usdbrdf.files.frames import CLIPPED_SHARE, read_recorded
-from usdbrdf.files.images import needs_float, white_of_mask, write_exr
+from usdbrdf.files.images import needs_float, read_radiance, white_of_mask, write_exr
 from usdbrdf.job.progress import progress
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Long
@@ -48,6 +48,8 @@ _TOUCHES = 1e-4
 # Rows of a frame whose places in the photograph are computed at a time, and frames whose places
 # are kept: the faces of one sphere.
 _ROWS, _KEPT_MAPS = 64, 6
+# In whose corners a rim is looked for, pixels of a corner's sides, and what is black there in JPEG.
+_PROBED_PICTURES, _CORNER, _BLACK_VALUE = 3, 4, 2 / 255
 _BESIDE_RIM = 4  # pixels beside a black rim that it reaches: half a block of JPEG
 
 
@@ -192,6 +194,44 @@ def _recorded(
     if black is not None:
         recorded[_rim_of(recorded, black)] = np.nan
     return recorded
+
+
+def with_rims(
+    records: Sequence[FrameRecord], folder: Path, findings: Findings, source: Path
+) -> list[FrameRecord]:
+    """Records of which those that lie in a folder of undistorted pictures, and whose cameras bend
+    nothing, have a rim if some of them are black in a corner."""
+    if any(record.rim for record in records):
+        return list(records)
+    undistorted = [
+        record.image_path
+        for record in records
+        if not record.lens.bends and _is_called_undistorted(record.image_path, folder)
+    ]
+    some = spread_evenly(len(undistorted), _PROBED_PICTURES)
+    if not any(_is_black_in_a_corner(undistorted[i]) for i in some):
+        return list(records)
+    findings.warn(
+        f"{source.name}: {len(undistorted)} pictures that have been undistorted are black along "
+        "their borders, which is left out. [capture.mask]"
+    )
+    concerned = set(undistorted)
+    return [replace(record, rim=record.image_path in concerned) for record in records]
+
+
+def _is_called_undistorted(picture: Path, folder: Path) -> bool:
+    inside = picture.relative_to(folder) if picture.is_relative_to(folder) else picture
+    return any("undistort" in part.lower() for part in inside.parent.parts)
+
+
+def _is_black_in_a_corner(picture: Path) -> bool:
+    try:
+        pixels = read_radiance(picture)
+    except ImageRefused:  # of which the reader of its pixels will tell
+        return False
+    black = _BLACK_VALUE if picture.suffix.lower() in PHOTOGRAPH_SUFFIXES else 0.0
+    ends = (slice(None, _CORNER), slice(-_CORNER, None))
+    return any(bool((pixels[rows, columns] <= black).all()) for rows in ends for columns in ends)
 
 
 def _rim_of(recorded: Float, black: float) -> Bool:

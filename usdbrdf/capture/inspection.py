@@ -313,12 +313,19 @@ def _cameras(frames: Frames) -> list[tuple[tuple[float, ...], int]]:
     return Counter(map(tuple, rows)).most_common()
 
 
+def _files(frames: Frames) -> Counter[str]:
+    """How many frames come of each kind of file."""
+    given = frames.photographs or (None,) * len(frames)
+    pairs = zip(given, frames.image_paths, strict=True)
+    return Counter((photograph or image).suffix.lower() for photograph, image in pairs)
+
+
 def _frames_summary(frames: Frames) -> dict[str, Any]:
     times = np.unique(frames.exposure_time)
     sizes = Counter(map(tuple, frames.resolution.tolist()))
     return {
         "count": len(frames),
-        "files": dict(Counter(path.suffix.lower() for path in frames.image_paths)),
+        "files": dict(_files(frames)),
         "cameras": len(_cameras(frames)),
         "resolutions": [{"width": w, "height": h, "frames": n} for (w, h), n in sizes.items()],
         "exposure_times": [float(time) for time in times],
@@ -329,8 +336,7 @@ def _frames_summary(frames: Frames) -> dict[str, Any]:
 
 
 def _frame_rows(frames: Frames, dropped: int, looked_at: int) -> Iterator[tuple[str, str]]:
-    files = Counter(path.suffix.lower() for path in frames.image_paths)
-    kinds = ", ".join(f"{n} {suffix[1:].upper()}" for suffix, n in files.most_common())
+    kinds = ", ".join(f"{n} {suffix[1:].upper()}" for suffix, n in _files(frames).most_common())
     seen = f"; the pixels of {looked_at} looked at" if looked_at else ""
     lost = f", {dropped} dropped" if dropped else ""
     yield "frames", f"{len(frames)}{lost} ({kinds}){seen}"

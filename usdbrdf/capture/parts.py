@@ -110,9 +110,7 @@ def label_table(path: Path) -> LabelTable:
         entries[number] = ObjectName(name or f"object_{number}", class_name, directive)
     ids = document.get("face_object_id")
     if ids is not None and not (isinstance(ids, list) and all(type(n) is int for n in ids)):
-        raise InputRefused(
-            f'{path}: "face_object_id" is not a list of whole numbers. [objects.format]'
-        )
+        raise InputRefused(f"{path}: face_object_id is no list of whole numbers. [objects.format]")
     return LabelTable(entries, None if ids is None else np.array(ids, np.int64))
 
 
@@ -245,8 +243,9 @@ def geometry_from_file(
     *,
     capture_root: Path,
     meters_per_unit: float = 1.0,
+    read: Callable[[Path], FileMesh] = mesh_from_file,
 ) -> ScanGeometry:
-    """Read, check, segment and clean a mesh.
+    """Read (by ``read``, but for USD), check, segment and clean a mesh.
 
     objects          objects.json; or what knows the objects of the mesh that was read, an id for
                      each of its triangles; or None. Options that ask to segment it come first
@@ -255,7 +254,7 @@ def geometry_from_file(
     """
     if mesh_path.suffix.lower() in USD_SUFFIXES:
         return geometry_from_usd(mesh_path, options, findings, capture_root=capture_root)
-    mesh = mesh_from_file(mesh_path)
+    mesh = read(mesh_path)
     if mesh.kept is not None:
         broken = int((~mesh.kept).sum())
         findings.count("broken_faces", broken)

@@ -24,6 +24,8 @@ _EXACT = 1e-14
 # of the image.
 LARGEST_OF_POSE = 1e9
 _FOCAL_LENGTHS, _FARTHEST_CENTRE = (0.01, 1000.0), 10.0
+# Of a picture's sides, by which principal points are off its middle, at most.
+_AT_CORNER = 0.1
 # The shortest focal length of a pinhole, in the same: 157 degrees, wider than lenses draw straight.
 _SHORTEST_PINHOLE = 0.1
 
@@ -38,13 +40,15 @@ def rigid_records(
     """
     kept: list[FrameRecord] = []
     worst = 0.0
+    # One of four tiles of a picture has its axis there too, the others have not.
+    offsets = all(map(_is_at_corner, records))
     for record in records:
         pose = record.world_from_camera
         if not is_camera_matrix(pose):
             findings.drop(
                 record.name, "its pose is not a finite 4 x 4 camera matrix", "capture.pose"
             )
-        elif said := _why_no_camera(record):
+        elif said := _why_no_camera(record, offsets):
             findings.drop(record.name, said, "capture.camera")
         else:
             rigid, off = _made_rigid(pose, record.name, source, pose_scale)
@@ -84,8 +88,18 @@ def is_camera_matrix(pose: Double) -> bool:
     )
 
 
-def _why_no_camera(record: FrameRecord) -> str:
-    """Why its numbers are not those of a camera of its size, a clause; "" where they may be."""
+def _is_at_corner(record: FrameRecord) -> bool:
+    """Whether the axis of a camera lies about where the first pixel does: that is an offset from
+    the picture's middle."""
+    place = np.divide(record.intrinsics[2:], np.maximum(record.resolution, 1))
+    return record.lens.curve != "equirectangular" and bool(np.abs(place).max() <= _AT_CORNER)
+
+
+def _why_no_camera(record: FrameRecord, offsets: bool) -> str:
+    """Why its numbers are not those of a camera of its size, a clause; "" where they may be.
+
+    offsets  whether the principal points of all cameras lie where the first pixel does
+    """
     lens = ", ".join(f"{number:g}" for number in record.intrinsics)
     size = " x ".join(map(str, record.resolution))
     bends = f" with {record.lens.curve} distortion" if record.lens.bends else ""
@@ -103,7 +117,7 @@ def _why_no_camera(record: FrameRecord) -> str:
             f"{said}: it would be {angle:.0f} degrees wide; all are in pixels, not in mm or sizes"
         )
     # That of a picture whose corner is its first pixel is an offset from its middle, or no pixels.
-    if max(map(abs, record.intrinsics[2:])) <= 1 and 4 * np.abs(centre).max() < 1:
+    if offsets or (max(map(abs, record.intrinsics[2:])) <= 1 and 4 * np.abs(centre).max() < 1):
         return f"{said}: cx and cy are pixels from its corner, not from its middle, nor sizes"
     camera = (record.lens, record.intrinsics, record.resolution)
     return why_no_lens(*camera) if views_of(*camera) else said

@@ -53,6 +53,8 @@ _PROFILES = {
     "display p3": "srgb_p3d65_scene",
     "sp3c": "srgb_p3d65_scene",
 }
+# Those of Android, GIMP, Ghostscript and others; not of linear values with the same primaries.
+_CALLED_SRGB = re.compile(r"^(?!.*(linear|\bg10\b)).*\bsrgb")
 _UNKNOWN_SHOWN_AS = (255, 0, 255)
 # Pictures are exposed so that this percentile comes out as this linear value.
 _SHOWN_PERCENTILE, _SHOWN_AS = 90, 0.8
@@ -80,7 +82,7 @@ def encoding_of_tag(name: str, chromaticities: tuple[float, ...]) -> str | None:
     """The colour space that an image says it has, see ``files.images.colour_tag``; None where it
     says nothing that is known."""
     profile = name.lower().strip()
-    if profile in _PROFILES or profile.startswith("srgb iec61966"):
+    if profile in _PROFILES or _CALLED_SRGB.search(profile):
         return _PROFILES.get(profile, DISPLAY_SPACE)
     if name and kind_of_encoding(name):
         return name

@@ -33,7 +33,7 @@ class Lens:
 
         x' = x R + 2 p1 x y + p2 (r^2 + 2 x^2) + s1 r^2 + s2 r^4 + b y'
         y' = y R + p1 (r^2 + 2 y^2) + 2 p2 x y + s3 r^2 + s4 r^4
-        R  = (1 + k1 r^2 + k2 r^4 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
+        R  = (1 + k1 r^2 + k2 r^4 + ... + o1 r + o2 r^3 + ...) / (1 + d1 r^2 + d2 r^4 + ...)
         pixel = (cx + fx x', cy + fy y')
 
     curve       perspective: r = tan t; fisheye (equidistant): r = t;
@@ -46,6 +46,8 @@ class Lens:
                 width / 2 pi, fy the height / pi (see ``whole_sphere``)
     shape       what the curve has beside t: (omega,), (k,), (k,), (alpha, beta)
     radial      k1, k2, ... as many as there are
+    odd         o1, o2, ...; r R then has even powers of r too: Pix4D's and ContextCapture's
+                fisheyes, see ``fisheye_of_turn``
     divisor     d1, d2, ...; OpenCV calls its three k4, k5, k6
     tangential  p1, p2 in OpenCV's order (Metashape's and Aria's are the other way round)
     prism       s1, s2, s3, s4
@@ -56,6 +58,7 @@ class Lens:
     curve: Curve = "perspective"
     shape: tuple[float, ...] = ()
     radial: tuple[float, ...] = ()
+    odd: tuple[float, ...] = ()
     divisor: tuple[float, ...] = ()
     tangential: tuple[float, float] = (0.0, 0.0)
     prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
@@ -63,13 +66,11 @@ class Lens:
     radial_first: bool = False
 
     def __post_init__(self) -> None:
-        numbers = (
-            *self.shape, *self.radial, *self.divisor, *self.tangential, *self.prism, self.skew
-        )  # fmt: skip
+        numbers = (*self.shape, *self._bending)
         if (
             self.curve not in get_args(Curve)
             or len(self.shape) != len(_SHAPE.get(self.curve, ()))
-            or max(len(self.radial), len(self.divisor)) > _MOST_RADIAL
+            or max(len(self.radial), len(self.odd), len(self.divisor)) > _MOST_RADIAL
             or not np.isfinite(numbers).all()
         ):
             raise InputRefused(f"{self}: this is no lens. Correct its numbers. [camera.lens]")
@@ -81,6 +82,7 @@ class Lens:
             *zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True),
             *zip(_SHAPE.get(self.curve, ()), self.shape, strict=True),
             *((f"k{i + 1}", k) for i, k in enumerate(self.radial)),
+            *((f"o{i + 1}", o) for i, o in enumerate(self.odd)),
             *((f"d{i + 1}", d) for i, d in enumerate(self.divisor)),
             *((f"p{i + 1}", p) for i, p in enumerate(self.tangential)),
             *((f"s{i + 1}", s) for i, s in enumerate(self.prism)),
@@ -92,9 +94,14 @@ class Lens:
     @property
     def bends(self) -> bool:
         """False for a pinhole."""
-        numbers = (*self.radial, *self.divisor, *self.tangential, *self.prism, self.skew)
         plain = self.curve in ("division", "undistorting") and not any(self.shape)
-        return bool(any(numbers) or not (self.curve == "perspective" or plain))
+        return bool(any(self._bending) or not (self.curve == "perspective" or plain))
+
+    @property
+    def _bending(self) -> tuple[float, ...]:
+        return (
+            *self.radial, *self.odd, *self.divisor, *self.tangential, *self.prism, self.skew
+        )  # fmt: skip
 
     def project(self, directions: Double, intrinsics: tuple[float, float, float, float]) -> Double:
         """Pixel coordinates (..., 2) of directions (..., 3) of any length in the camera, whose x
@@ -172,6 +179,8 @@ class Lens:
     def _stretch(self, squared: Double) -> Double:
         """R of r^2."""
         above = np.polyval((*self.radial[::-1], 1.0), squared)
+        if self.odd:
+            above = above + np.sqrt(squared) * np.polyval(self.odd[::-1], squared)
         return np.asarray(above / np.polyval((*self.divisor[::-1], 1.0), squared))
 
     def _distorted(self, plane: Double) -> Double:
@@ -200,6 +209,37 @@ def _widest_angle(lens: Lens) -> float:
     with np.errstate(invalid="ignore"):
         inwards = np.flatnonzero(~(np.diff(lens.distance(angles)) > 0))
     return float(angles[inwards[0] if len(inwards) else -1])
+
+
+def is_fisheye_of_turn(matrix: Double, terms: tuple[float, ...]) -> bool:
+    """Whether these numbers are such a fisheye's: none mirrors, or turns the picture inside out."""
+    finite = np.isfinite(matrix).all() and np.isfinite(terms).all()
+    return bool(finite and terms[0] > 0 and np.linalg.det(matrix) > 0)
+
+
+def fisheye_of_turn(
+    matrix: Double, terms: tuple[float, ...]
+) -> tuple[Lens, tuple[float, float], Double]:
+    """The lens, fx, fy and the turn (3, 3) of Pix4D's fisheyes, which ContextCapture has too.
+
+    A direction at the angle t off the axis comes to lie at p1 s + p2 s^2 + ... of s = 2 t / pi in
+    its own azimuth, which ``matrix`` (2, 2) takes to pixels from the principal point. What in that
+    turns the picture becomes a turn of the camera around its axis, x right and y down: directions
+    are turned by it before the lens.
+
+    terms  p1, p2, ...
+    """
+    first, *more = terms
+    fy = float(np.hypot(*matrix[1]))
+    cosine, sine = matrix[1, 1] / fy, matrix[1, 0] / fy
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    fx, skewed = float(np.linalg.det(matrix)) / fy, float(matrix[0] @ (sine, cosine))
+    scales = [term / first * (2 / np.pi) ** (i + 1) for i, term in enumerate(more)]
+    lens = Lens(
+        curve="fisheye", odd=tuple(scales[::2]), radial=tuple(scales[1::2]), skew=skewed / fx
+    )
+    scale = 2 / np.pi * first
+    return lens, (fx * scale, fy * scale), turn
 
 
 def whole_sphere(width: float, height: float) -> tuple[float, float, float, float]:

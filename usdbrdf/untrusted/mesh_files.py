@@ -4,7 +4,7 @@ and what is put into a scene with its materials."""
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from io import BytesIO
@@ -88,6 +88,19 @@ def mesh_from_file(path: Path) -> FileMesh:
             f"{path}: meshes are read from {', '.join(SUFFIXES)} and USD. {cure}. [mesh.format]"
         )
     return read_in_child("mesh", f"{__name__}:read_mesh_here", path, FileMesh)
+
+
+def mesh_of_tiles(paths: Sequence[Path]) -> FileMesh:
+    """The meshes of several files as one; what these call their parts says nothing of the whole."""
+    tiles = [mesh_from_file(path) for path in paths]
+    first = np.cumsum([0, *(len(tile.points) for tile in tiles)])
+    triangles = [tile.triangles + start for tile, start in zip(tiles, first, strict=False)]
+    all_kept = [np.ones(len(t.triangles), np.bool_) if t.kept is None else t.kept for t in tiles]
+    return FileMesh(
+        points=np.concatenate([tile.points for tile in tiles]),
+        triangles=np.concatenate(triangles).astype(np.int32),
+        kept=None if all(tile.kept is None for tile in tiles) else np.concatenate(all_kept),
+    )
 
 
 def model_from_file(path: Path) -> tuple[Surface, ...]:

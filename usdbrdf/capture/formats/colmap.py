@@ -28,7 +28,13 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
-from usdbrdf.capture.formats.named_pictures import Pictured, mask_beside, path_in_capture, scan_of
+from usdbrdf.capture.formats.named_pictures import (
+    Pictured,
+    mask_beside,
+    mesh_beside,
+    path_in_capture,
+    scan_of,
+)
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -44,8 +50,8 @@ NAME = "colmap"
 DESCRIPTION = DESCRIPTIONS[NAME]
 # Workspaces below the capture, as COLMAP and those who follow it lay them out; where the model lies
 # in a workspace; and where its images do.
-_WORKSPACES = ("", "dense", "dense/0", "undistorted", "colmap", "distorted")
-_MODELS = ("", "sparse/0", "sparse")
+_WORKSPACES = ("", "dense", "dense/0", "colmap_dense", "undistorted", "colmap", "distorted")
+_MODELS = ("", "sparse/0", "sparse", "colmap_sparse/0", "colmap_text")
 _IMAGES = ("images", "input", "", "images_2", "images_4", "images_8")
 # What scaled-down copies of images are in.
 _REDUCED = re.compile(r"(^|/)images_\d+$")
@@ -336,7 +342,4 @@ def _mesh(path: Path, options: CaptureOptions) -> Path:
             mesh = path_in_capture(path, _joined(workspace, name), options)
             if mesh.is_file():
                 return mesh
-    raise InputRefused(
-        f"{path}: no mesh beside the COLMAP model ({', '.join(_MESHES)}). Make one with 'colmap "
-        "poisson_mesher', or name one with --mesh. [mesh.missing]"
-    )
+    return mesh_beside(path, options, how="Make one with 'colmap poisson_mesher'")

@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
+from usdbrdf.capture.develop import with_rims
 from usdbrdf.capture.parts import (
     LabelTable,
     as_photographs,
@@ -419,6 +420,7 @@ def scan_of(
                 f"{record.name!r} in {source.name} bends light. Bring the original pictures, or "
                 "the cameras that were exported for these. [capture.camera]"
             )
+    records = with_rims(records, folder, findings, source)
     if masks := sum(record.mask_path is not None for record in records):
         findings.warn(
             f"{source.name}: {masks} masks are used; what is black there is not looked at. "

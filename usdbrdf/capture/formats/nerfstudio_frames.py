@@ -14,24 +14,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.formats.colmap import world_from_camera
+from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.tables import beginning_of, numbers_among
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
+from usdbrdf.untrusted.colmap_models import colmap_model, model_files
 from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 FILE = "dataparser_transforms.json"
 # What its exporters call their meshes, but for mesh.obj, which anybody's may be called.
 EXPORTED = ("poisson_mesh.ply", "tsdf_mesh.ply", "sdf_marching_cubes_mesh.ply")
+# What COLMAP calls its meshes, and where its models lie that documents were made of, instant-ngp's
+# first.
+_COLMAPS = ("meshed-poisson.ply", "meshed-delaunay.ply")
+_OF_NGP_MODELS = ("colmap_sparse", "colmap_text")
+_MODELS = ("colmap_sparse/0", "colmap_text", "colmap/sparse/0", "sparse/0", "sparse")
+# Of the cameras' spread, and of rotations: by how much two poses of one camera may differ; what is
+# less than rounding is no other frame.
+_SAME_CAMERA, _SAME_FRAME = 1e-2, 1e-6
 _LARGEST = 1e9  # number that makes sense in a matrix
 # By which instant-ngp's meshes are known, PLY and OBJ; what it takes where a document says nothing.
 _OF_NGP = (b"output from https://github.com/NVlabs/instant-ngp", b"mtllib nerf.mtl")
@@ -98,12 +109,14 @@ def geometry_at_home(
     applied: Applied,
     document: Mapping[str, Any],
     *,
+    folder: Path,
     meters_per_unit: float,
 ) -> ScanGeometry:
     """What is read of a mesh, in the frame of the capture if it lay in that of a training on the
-    document's.
+    document's, or of the model of COLMAP that this was made of.
 
     read             is given options whose unit is the mesh's own
+    folder           the document's
     meters_per_unit  of the capture, unless the options say it
     """
     if any(mark in beginning_of(mesh) for mark in _OF_NGP) and not document.get("from_mitsuba"):
@@ -113,15 +126,30 @@ def geometry_at_home(
         )
         home = np.linalg.inv(applied.similarity) @ _document_from_ngp(mesh, document)
         return _moved(read, np.asarray(home, np.float64), options, meters_per_unit)
+    if mesh.name in _COLMAPS and (found := _capture_from_colmap(mesh, folder, findings)):
+        model, moved = found
+        findings.warn(
+            f"{mesh.name}: is called as COLMAP's meshes, which lie in the frame of its model "
+            f"{model.relative_to(folder).as_posix()}; it is brought to that of the poses, by the "
+            "cameras of both. Rename it if it lies there already. [mesh.frame]"
+        )
+        return _moved(read, moved, options, meters_per_unit)
     statements = statements_beside(mesh)
-    if not statements or mesh.suffix.lower() in USD_SUFFIXES:
-        if statements:
+    if statements and mesh.suffix.lower() in USD_SUFFIXES:
+        raise InputRefused(
+            f"{mesh}: {FILE} beside it says that it lies in the frame that nerfstudio trained in, "
+            "from which USD files are not brought back. Name nerfstudio's own PLY or OBJ with "
+            "--mesh, or remove that file if this one has been moved back already. [mesh.frame]"
+        )
+    if not statements:
+        moved_away = any((folder / name).is_dir() for name in _OF_NGP_MODELS)
+        if moved_away and mesh.name not in _COLMAPS:
             findings.warn(
-                f"{mesh.name}: is read as it lies; {FILE} beside it is for meshes of nerfstudio's "
-                "own export (PLY, OBJ). Name that one with --mesh if this was made of it and has "
-                "not been moved back. [mesh.frame]"
+                f"{mesh.name}: is taken to lie in the frame of the poses, which instant-ngp's "
+                "colmap2nerf.py moves away from COLMAP's. If it was made of COLMAP's model, call "
+                f"it {_COLMAPS[0]}, or read that with --adapter colmap. [mesh.frame]"
             )
-        elif mesh.name in EXPORTED:
+        if mesh.name in EXPORTED:
             findings.warn(
                 f"{mesh.name}: is called as nerfstudio exports its meshes, which lie in the frame "
                 f"that it trained in. Put {FILE}, which lies beside the training's config.yml, "
@@ -173,6 +201,48 @@ def _trained_from_capture(statement: Path, applied: Applied) -> Double:
     trained = np.diag([scale[0] / applied.scale] * 3 + [1.0])
     inner = matrix @ np.linalg.inv(applied.matrix)
     return np.asarray(trained @ inner @ applied.similarity, np.float64)
+
+
+def _capture_from_colmap(
+    mesh: Path, folder: Path, findings: Findings
+) -> tuple[Path, Double] | None:
+    """The model of COLMAP beside a document, and the similarity (4, 4) from its frame to the
+    capture's; None where there is none, it has not the same cameras, or the frame is the same."""
+    models, frames = _models_beside(folder), findings.frames
+    if not models or frames is None:
+        return None
+    try:
+        model = colmap_model(models[0])
+    except UsdBrdfError as error:
+        findings.warn(
+            f"{mesh.name}: is called as COLMAP's meshes, but whether it lies in another frame than "
+            f"the poses is not known, as its model was not read ({error}). [mesh.frame]"
+        )
+        return None
+    theirs = {PurePosixPath(name).stem: k for k, name in enumerate(model.names)}
+    pairs = [(i, theirs.get(path.stem)) for i, path in enumerate(frames.image_paths)]
+    known = [(i, k) for i, k in pairs if k is not None]
+    if len(known) < max(3, len(frames) / 2) or len({k for _, k in known}) < len(known):
+        return None
+    ours, their = (list(numbers) for numbers in zip(*known, strict=True))
+    ends = frames.world_from_camera[ours]
+    starts = np.stack([world_from_camera(model.camera_from_world[k]) for k in their])
+    turns = ends[:, :3, :3] @ np.swapaxes(starts[:, :3, :3], 1, 2)
+    left, _, right = np.linalg.svd(turns.mean(axis=0))
+    turn = left @ right
+    from_places, to_places = starts[:, :3, 3] @ turn.T, ends[:, :3, 3]
+    from_centre, centre = from_places.mean(axis=0), to_places.mean(axis=0)
+    spread = float(np.linalg.norm(to_places - centre))
+    scale = spread / max(float(np.linalg.norm(from_places - from_centre)), 1 / _LARGEST)
+    off = np.linalg.norm(scale * (from_places - from_centre) + centre - to_places, axis=1)
+    if max(np.abs(turns - turn).max(), off.max() / max(spread, 1 / _LARGEST)) > _SAME_CAMERA:
+        return None
+    moved = rigid_pose(scale * turn, centre - scale * from_centre)
+    return None if np.abs(moved - np.eye(4)).max() < _SAME_FRAME else (models[0], moved)
+
+
+def _models_beside(folder: Path) -> list[Path]:
+    return [folder / place for place in _MODELS if model_files(folder / place)]
 
 
 def _document_from_ngp(mesh: Path, document: Mapping[str, Any]) -> Double:

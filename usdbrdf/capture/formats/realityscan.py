@@ -162,8 +162,11 @@ def records_of_sidecars(
         said = _sidecar_values(read_xml(file))
         rotation, place = _numbers(said, "Rotation", 9), _numbers(said, "Position", 3)
         focal = number_in(said, "FocalLength35mm")
-        model = said.get("DistortionModel", "perspective")
-        if model != "perspective" and not model.startswith("brown"):
+        model, terms = said.get("DistortionModel", "perspective"), _terms(said)
+        if not (model == "perspective" or model.startswith("brown")) and (
+            # Of the usual model without terms it is a pinhole.
+            model != "division" or any(terms)
+        ):
             raise InputRefused(
                 f"{file}: the lens model {model!r} is not read. Choose Brown in the alignment's "
                 "settings, and export again. [capture.camera]"
@@ -179,9 +182,8 @@ def records_of_sidecars(
             )
             continue
         centre = [number_in(said, f"PrincipalPoint{axis}") or 0.0 for axis in "UV"]
-        terms = _numbers(said, "DistortionCoeficients", 6)
         pose = opengl_from_opencv(rigid_pose(rotation.reshape(3, 3).T, place))
-        bent = list(terms) if terms is not None and model != "perspective" else [0.0] * 6
+        bent = terms if model != "perspective" else [0.0] * 6
         squeeze = number_in(said, "AspectRatio") or 1.0
         yield from _record(name, image, pose, focal, centre, bent, findings, squeeze)
 
@@ -207,6 +209,11 @@ def _sidecar_values(root: Element) -> dict[str, str]:
         values |= {k.removeprefix(_NAMESPACE): v for k, v in described.attrib.items()}
         values |= {c.tag.removeprefix(_NAMESPACE): c.text or "" for c in described}
     return values
+
+
+def _terms(said: Mapping[str, str]) -> list[float]:
+    found = _numbers(said, "DistortionCoeficients", 6)
+    return [0.0] * 6 if found is None else [float(number) for number in found]
 
 
 def _numbers(said: Mapping[str, str], key: str, count: int) -> Double | None:

@@ -108,6 +108,7 @@ def _geometry(capture: _Capture, findings: Findings) -> ScanGeometry:
         findings,
         capture.applied,
         capture.document,
+        folder=root,
         meters_per_unit=unit,
     )
 

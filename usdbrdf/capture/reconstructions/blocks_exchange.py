@@ -23,7 +23,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import Element, beginning_of_text, files_of, numbers_of, read_xml
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
-from usdbrdf.model.lens import Lens, whole_sphere
+from usdbrdf.model.lens import Lens, fisheye_of_turn, is_fisheye_of_turn, whole_sphere
 from usdbrdf.options import CaptureOptions
 
 NAME = "blocks-exchange"
@@ -31,6 +31,7 @@ DESCRIPTION = DESCRIPTIONS[NAME]
 _METADATA = "metadata.xml"
 # How deep a tile of a production lies below what tells of all.
 _ABOVE = 3
+_UNEVEN = 1e-6  # of an AspectRatio, which is told
 _AXES = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
 # Coordinate systems in degrees, or from the Earth's centre: by name, by what a text of WKT names
 # first (those of projected systems lie within), and by EPSG's code of the horizontal part.
@@ -77,6 +78,11 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     block = _block(root, source, findings)
     systems = {_text(row, "Id"): _text(row, "Definition") for row in root.iter("SRS")}
     system = systems.get(_text(block, "SRSId"), "")
+    if any(abs(_aspect(group) - 1) > _UNEVEN for group in block.iter("Photogroup")):
+        findings.warn(
+            f"{source.name}: pixels that are not square; AspectRatio is taken for the focal length "
+            "down its pictures in parts of that across. [capture.camera]"
+        )
     tiles = sorted(source.parent.glob("Data/*/*.obj"))
     return scan_of_shots(
         shots_of(block, _origin(source, system, options, findings), source),
@@ -86,12 +92,21 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         source=source,
         folder=source.parent,
         meshes=("mesh.*", "model.*", *(["Data/*/*.obj"] if len(tiles) == 1 else [])),
-        how=f"Its model is in {len(tiles)} tiles: produce it without tiling"
-        if len(tiles) > 1
-        else "Put the model that was made in this block's coordinate system into this folder, with "
+        tiles=() if options.mesh else _refined_once(tiles, source),
+        how="Put the model that was made in this block's coordinate system into this folder, with "
         f"{_METADATA} of its production",
         in_metres=bool(system),
     )
+
+
+def _refined_once(tiles: list[Path], source: Path) -> list[Path]:
+    """The files of a model, one of each tile; InputRefused where these have levels of detail."""
+    if len({tile.parent for tile in tiles}) < len(tiles):
+        raise InputRefused(
+            f"{source}: the tiles of its model in Data/ have levels of detail. Produce it without "
+            "these, or name one mesh of the whole with --mesh. [mesh.missing]"
+        )
+    return tiles
 
 
 def beside_mesh(mesh: Path) -> list[Path]:
@@ -105,9 +120,13 @@ def _block(root: Element, source: Path, findings: Findings) -> Element:
     blocks = list(root.iter("Block"))
     posed = [sum(_pose(photo, "") is not None for photo in block.iter("Photo")) for block in blocks]
     if not any(posed):
+        others = (root.find(f".//Pose/Rotation/{name}") for name in ("Yaw", "Heading"))
         raise InputRefused(
             f"{source}: no photograph with rotation and centre. Export the block of the "
             "aerotriangulation. [capture.alignment]"
+            if all(other is None for other in others)
+            else f"{source}: its rotations are headings, pitches and rolls, which are not read. "
+            "Export them as matrices, or as omega, phi and kappa. [capture.pose]"
         )
     chosen = blocks[int(np.argmax(posed))]
     if len(blocks) > 1:
@@ -186,14 +205,16 @@ def shots_of(block: Element, origin: Double, source: Path) -> Iterator[Shot]:
     """The photographs of a block, in the frame whose origin that is."""
     for group in block.iter("Photogroup"):
         unset = _text(group, "ManualPose").lower() == "false"
-        camera, axes = _camera(group, source), _text(group, "CameraOrientation")
+        (camera, turn), axes = _camera(group, source), _text(group, "CameraOrientation")
         for photo in group.iter("Photo"):
             pose = None if unset else _pose(photo, axes)
             if pose is not None:
+                pose[:3, :3] = pose[:3, :3] @ turn.T
                 pose[:3, 3] -= origin
             apart = _text(photo, "Component") == "0"
             yield Shot(
                 name=_text(photo, "ImagePath"),
+                mask=_text(photo, "MaskPath"),
                 camera=camera,
                 world_from_camera=pose,
                 problem="it is of no component of the block" if apart and pose is not None else "",
@@ -227,33 +248,68 @@ def _pose(photo: Element, axes: str) -> Double | None:
     return rigid_pose(opencv_from_world.T, np.array(centre, np.float64))
 
 
-def _camera(group: Element, source: Path) -> ShotCamera | None:
+def _camera(group: Element, source: Path) -> tuple[ShotCamera | None, Double]:
+    """A group's, and how it is turned (3, 3) around its axis where that is of the lens."""
     width, height = (_number(group, f"ImageDimensions/{side}") for side in ("Width", "Height"))
+    straight = np.eye(3)
     if width is None or height is None or not min(width, height) >= 1:
-        return None
+        return None, straight
     size = int(width), int(height)
     kind = _text(group, "CameraModelType") or "Perspective"
     if kind == "Spherical":
         whole = Lens(curve="equirectangular")
-        return ShotCamera(resolution=size, intrinsics=whole_sphere(*size), lens=whole)
-    uneven = abs((_number(group, "AspectRatio") or 1.0) - 1) > 1e-6 or _number(group, "Skew")
-    if kind != "Perspective" or uneven:
-        said = f"of the type {kind[:40]!r}" if kind != "Perspective" else "with AspectRatio or Skew"
+        return ShotCamera(resolution=size, intrinsics=whole_sphere(*size), lens=whole), straight
+    skewed = _number(group, "Skew")
+    if kind not in ("Perspective", "Fisheye") or skewed:
+        said = "with Skew" if skewed else f"of the type {kind[:40]!r}"
         raise InputRefused(
-            f"{source}: cameras {said} are not read (known: Perspective with square pixels, and "
-            "Spherical). Export undistorted photographs with their own block. [capture.camera]"
+            f"{source}: cameras {said} are not read (known: Perspective, Fisheye, Spherical). "
+            "Export undistorted photographs with their own block. [capture.camera]"
         )
     focal, centre = _in_pixels(group, size)
-    terms = [_number(group, f"Distortion/{name}") or 0.0 for name in ("K1", "K2", "K3")]
+    if kind == "Fisheye":
+        matrix = _focal_matrix(group, focal)
+        terms = _fisheye_terms(group, source)
+        if matrix is None or not is_fisheye_of_turn(matrix, terms):
+            return None, straight
+        lens, focals, turn = fisheye_of_turn(matrix, terms)
+        return ShotCamera(resolution=size, intrinsics=(*focals, *centre), lens=lens), turn
+    radial = [_number(group, f"Distortion/{name}") or 0.0 for name in ("K1", "K2", "K3")]
     p1, p2 = (_number(group, f"Distortion/{name}") or 0.0 for name in ("P1", "P2"))
     if focal is None or not focal > 0:
-        return None
-    return ShotCamera(
+        return None, straight
+    camera = ShotCamera(
         resolution=size,
-        intrinsics=(focal, focal, *centre),
+        intrinsics=(focal, focal * _aspect(group), *centre),
         # P1 goes with r^2 + 2 x^2, which OpenCV's p2 does.
-        lens=Lens(radial=tuple(terms), tangential=(p2, p1)),
+        lens=Lens(radial=tuple(radial), tangential=(p2, p1)),
     )
+    return camera, straight
+
+
+def _aspect(group: Element) -> float:
+    """By which the focal length is longer down a picture than across it."""
+    return _number(group, "AspectRatio") or 1.0
+
+
+def _focal_matrix(group: Element, focal: float | None) -> Double | None:
+    """(2, 2): pixels of a fisheye per quarter of a turn, of which many state the focal length."""
+    entries = [_number(group, f"FisheyeFocalMatrix/M_{i}{k}") for i in (0, 1) for k in (0, 1)]
+    if None not in entries:
+        return np.array(entries, np.float64).reshape(2, 2)
+    return None if focal is None else np.diag([focal, focal * _aspect(group)]) * (np.pi / 2)
+
+
+def _fisheye_terms(group: Element, source: Path) -> tuple[float, ...]:
+    """P1 to P4 of a quarter of a turn."""
+    first, *terms = (_number(group, f"FisheyeDistortion/P{i}") for i in range(5))
+    if first:
+        raise InputRefused(
+            f"{source}: P0 of FisheyeDistortion is {first:g}, which leaves a hole in the middle "
+            "of the picture. Calibrate the camera with P0 fixed at 0. [capture.camera]"
+        )
+    p1, *more = terms
+    return (1.0 if p1 is None else p1, *(term or 0.0 for term in more))
 
 
 def _in_pixels(group: Element, size: tuple[int, int]) -> tuple[float | None, tuple[float, float]]:

@@ -3,11 +3,11 @@ camera and a pose by numbers, pictures lie in some folder, and a mesh that was e
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
@@ -15,12 +15,14 @@ from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     drop_without_picture,
     mesh_beside,
+    path_in_capture,
     pictures_of,
     refuse_without_pictures,
     scan_of,
     warn_of_radiance,
     warn_of_unused,
 )
+from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
@@ -28,7 +30,9 @@ from usdbrdf.files.tables import numbers_among
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Lens
+from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
+from usdbrdf.untrusted.mesh_files import mesh_of_tiles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +65,8 @@ class Shot:
     """One photograph of a document.
 
     name               by which its picture is found, a path or its end
+    mask               the path, or its end, of a picture that hides what is black in it; "" where
+                       the document names none
     camera             None where it has none
     world_from_camera  (4, 4), OpenCV's axes, in the frame of the mesh; None where it has none
     problem            a clause that says why it cannot be used although it has both
@@ -70,6 +76,7 @@ class Shot:
     camera: ShotCamera | CentredCamera | None
     world_from_camera: Double | None
     problem: str = ""
+    mask: str = ""
 
 
 def rows_of(document: object, key: str) -> list[dict[str, Any]]:
@@ -88,6 +95,21 @@ def folder_of(path: Path) -> Path:
     """A folder, or that of a file, absolute."""
     path = path.resolve()
     return path if path.is_dir() else path.parent
+
+
+def _mask_called(name: str, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
+    """The mask of this path: below the capture's folder by the end of the path, else beside its
+    picture, else in masks/; None where it lies nowhere there."""
+    parts = [
+        part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..")
+    ]
+    inside = ["/".join(parts[i:]) for i in range(len(parts))]
+    places = [folder / place for place in inside]
+    places += [picture.parent / parts[-1], folder / "masks" / parts[-1]] if parts else []
+    found = next((p for p in places if os.path.isfile(p) and p != picture), None)
+    if found is None or not found.is_relative_to(folder):
+        return found
+    return path_in_capture(folder, found.relative_to(folder).as_posix(), options)
 
 
 def files_of_capture(folder: Path, *, meshes: tuple[str, ...]) -> list[Path]:
@@ -110,6 +132,7 @@ def scan_of_shots(
     pictures_in: tuple[str, ...] = (),
     meshes: tuple[str, ...],
     how: str,
+    tiles: Sequence[Path] = (),
     up_axis: str | None = None,
     in_metres: bool = False,
     rim: bool = False,
@@ -120,6 +143,7 @@ def scan_of_shots(
     pictures_in     where the pictures lie below it, "" for there; empty: where most programs have
                     them
     meshes, how     patterns of the program's own names, and what to do where there is no mesh
+    tiles           files of one mesh, which is taken of them where no other is there
     up_axis         None where the format does not say
     rim             what is black along the pictures' borders is no part of them
     in_metres       False where the unit is that of the reconstruction, which nobody knows
@@ -131,7 +155,7 @@ def scan_of_shots(
         )
     pictures = pictures_of(folder, options, *pictures_in)
     refuse_without_pictures(pictures, source)
-    records = []
+    records, lacking = [], list[str]()
     for shot in shots:
         if shot.world_from_camera is None or shot.camera is None or shot.problem:
             missing = "it has no pose" if shot.world_from_camera is None else "it has no camera"
@@ -148,6 +172,9 @@ def scan_of_shots(
             except ImageRefused as error:
                 findings.drop(shot.name, clause_of(error, image), "capture.image")
                 continue
+        mask = _mask_called(shot.mask, image, folder, options) if shot.mask else None
+        if shot.mask and mask is None:
+            lacking.append(shot.mask)
         records.append(
             FrameRecord(
                 name=shot.name,
@@ -157,16 +184,41 @@ def scan_of_shots(
                 resolution=camera.resolution,
                 size_of_image=camera is not shot.camera,
                 lens=camera.lens if camera.lens.bends else PINHOLE,
-                mask_path=pictures.mask_of(image, folder, options),
+                mask_path=mask or pictures.mask_of(image, folder, options),
                 rim=rim,
             )
         )
     records.sort(key=lambda record: record.image_path)
     warn_of_radiance(pictures.instead, findings, source)
-    warn_of_unused(pictures, (r.image_path for r in records), findings, source)
+    used = (path for r in records for path in (r.image_path, r.mask_path) if path)
+    warn_of_unused(pictures, used, findings, source)
+    if lacking:
+        findings.warn(
+            f"{source.name}: {len(lacking)} of the masks that it names are not there, first "
+            f"{lacking[0]!r}, so those pictures are looked at whole. Put them into a folder masks. "
+            "[capture.mask]"
+        )
+
+    def geometry() -> Path | ScanGeometry:
+        whole = any(next(folder.glob(pattern), None) for pattern in meshes)
+        if options.mesh is not None or whole or not tiles:
+            return mesh_beside(folder, options, *meshes, how=how)
+        findings.warn(
+            f"{source.name}: the mesh is that of {len(tiles)} tiles, first "
+            f"{tiles[0].relative_to(folder).as_posix()}. [mesh.tiles]"
+        )
+        return geometry_from_file(
+            tiles[0],
+            options.objects,
+            options,
+            findings,
+            capture_root=folder,
+            read=lambda _: mesh_of_tiles(tiles),
+        )
+
     return scan_of(
         records,
-        partial(mesh_beside, folder, options, *meshes, how=how),
+        geometry,
         options,
         findings,
         adapter=adapter,
