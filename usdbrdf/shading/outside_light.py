@@ -141,9 +141,11 @@ def _solved_channel(
     # A row for each texel: what is done with it then lies together.
     share = np.ascontiguousarray(sources.share.T)
 
+    sums = sparse.csr_matrix((np.zeros(len(every)), every, first), (num_segments, len(every)))
+
     def gathered(factor: Double, values: Double) -> Double:
         """(M, ...): sums of factor (N,) times values (N, ...) over the texels of each segment."""
-        sums = sparse.csr_matrix((factor, every, first), (num_segments, len(every)))
+        sums.data[:] = factor  # making another matrix takes longer than the sums
         return np.asarray(sums @ values)
 
     for _ in range(iterations):
