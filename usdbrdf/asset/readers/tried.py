@@ -89,18 +89,19 @@ def refuse_special(folder: Path) -> None:
 def refuse_special_behind(layer: str) -> None:
     """The same for whatever a layer names as a part of its stage, wherever that lies: the layers
     are opened one by one, so this is for a child."""
-    waiting: list[str] = [layer]
-    opened: dict[str, Sdf.Layer | None] = {}
+    waiting, seen, kept = [layer], {layer}, []
     while waiting:
-        path = waiting.pop()
-        opened[path] = None
+        found = None
         with suppress(Tf.ErrorException):  # which whoever composes the stage will say
-            opened[path] = Sdf.Layer.FindOrOpen(path)
-        named = opened[path].GetCompositionAssetDependencies() if opened[path] else ()
-        for name in named:
-            place, _ = Sdf.Layer.SplitIdentifier(opened[path].ComputeAbsolutePath(name))
-            if place not in opened:
+            found = Sdf.Layer.FindOrOpen(waiting.pop())
+        if found is None:
+            continue
+        kept.append(found)  # or it would be read again
+        for name in found.GetCompositionAssetDependencies():
+            place, _ = Sdf.Layer.SplitIdentifier(found.ComputeAbsolutePath(name))
+            if place not in seen:
                 _refuse_special([Path(place)])
+                seen.add(place)
                 waiting.append(place)
 
 
