@@ -139,6 +139,15 @@ def _one_thread_of_blas():
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _not_flushed():
+    """A disk takes milliseconds to flush each of the hundreds of files of an asset, and no test
+    cuts the power of this one: those about flushing see what is asked of it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", os.fstat)  # which refuses what is not open, too
+        yield
+
+
 @pytest.fixture(scope="session")
 def _forking():
     children = Children()

@@ -50,6 +50,14 @@ def job_of(folder: Path, values: dict[str, str]):
     return model.create_job(job_template=template, job_parameter_values=known)
 
 
+def test_a_scan_is_there_once_however_often_and_by_whichever_way_it_is_named(tmp_path):
+    first, second = folders(tmp_path, "a", "b")
+    link = tmp_path / "link"
+    link.symlink_to(first)
+    assert list_of([second, first, link, tmp_path / "b" / ".", second]).places == ("b", "a")
+    assert list_of([link, second, first]).places == ("link", "b")
+
+
 def test_openjd_makes_a_job_of_it(tmp_path):
     scans = list_of(folders(tmp_path / "scans", "a", "b", "c", "d", "e"))
     sky, outside = tmp_path / "sky.exr", tmp_path / "outside"

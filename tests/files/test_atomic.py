@@ -306,3 +306,22 @@ def test_errors_of_the_machine_are_translated():
         raise BrokenPipeError
     with pytest.raises(ValueError, match="ours"), environment_failures("x"):
         raise ValueError("ours")
+
+
+def test_an_error_does_not_name_what_is_temporary(tmp_path):
+    taken = tmp_path / "taken.txt"
+    (taken / "x").mkdir(parents=True)
+    with (
+        pytest.raises(EnvironmentFailure, match=rf"^x: Is a directory \('{taken}'\)\."),
+        environment_failures("x"),
+    ):
+        write_text_atomic(taken, "a")
+    with (
+        pytest.raises(EnvironmentFailure, match=rf"^x: No such file.* \('{tmp_path}'\)\."),
+        environment_failures("x"),
+        temporary_folder(tmp_path / "new") as staged,
+    ):
+        (staged / "none" / "below").touch()
+    theirs = tmp_path / ".tmp-theirs" / "a"
+    with pytest.raises(EnvironmentFailure, match=str(theirs)), environment_failures("x"):
+        theirs.read_text()

@@ -103,6 +103,25 @@ def test_a_pipe_among_the_layers_is_not_waited_for(
 
 
 @pytest.mark.fault("I13")
+@pytest.mark.parametrize("name", ["package", "validate"])
+def test_a_pipe_that_the_edits_name_elsewhere_is_not_waited_for(
+    converted, strange, tmp_path, capfd, name
+):
+    calls_of_it = calls(strange, converted.folder, tmp_path)[name]
+    pipe, between = strange.parent / "pipe.usda", strange.parent / "between.usda"
+    os.mkfifo(pipe)
+    between.write_text('#usda 1.0\nover "x" (references = @pipe.usda@) {}\n')
+    names = "@../none.usda@, @../between.usda@"
+    (strange / "edits.usda").write_text(f"#usda 1.0\n(\n    subLayers = [{names}]\n)\n")
+    try:
+        assert main(calls_of_it) == 3
+    finally:
+        pipe.unlink()
+        between.unlink()
+    assert f"{pipe}: this is no regular file" in capfd.readouterr().err
+
+
+@pytest.mark.fault("I13")
 def test_a_pipe_in_the_place_of_the_edits_stops_no_measurement(capture, base, converted, capfd):
     folder = base / "pipe" / "room"
     shutil.copytree(converted.folder, folder)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
+import struct
 import threading
 from urllib.parse import urlsplit
 
@@ -69,6 +71,66 @@ def test_verdicts_are_written_for_the_page_alone(server, built):
     assert not review_file(built.asset).exists()
     assert asked(server, "POST", path, body, Origin=own, **kind) == (200, b"saved")
     assert read_review(built.asset)[CHAIR].comment == "fine"
+
+
+def said_to(server, request, *, reset=False):
+    """The first line that is answered to bytes; or none, if whoever asks is gone by then."""
+    place = urlsplit(server.address)
+    with socket.create_connection((place.hostname, place.port), timeout=200) as connection:
+        connection.sendall(request)
+        if reset:
+            at_once = struct.pack("ii", 1, 0)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, at_once)
+            return b""
+        connection.shutdown(socket.SHUT_WR)
+        with connection.makefile("rb") as answer:
+            return answer.readline()
+
+
+@pytest.mark.parametrize(
+    ("length", "status"),
+    [(b"\xb2", 413), (b"9" * 5000, 413), (b"-1", 413), (b"", 413), (b"9", 400)],
+)
+def test_a_length_that_is_none_or_a_lie_writes_nothing(server, built, capsys, length, status):
+    place = urlsplit(server.address)
+    said = said_to(
+        server,
+        f"POST {place.path}review HTTP/1.1\r\nHost: {place.netloc}\r\n"
+        "Content-Type: application/json\r\nContent-Length: ".encode()
+        + length
+        + b"\r\n\r\n{}",
+    )
+    assert said.startswith(f"HTTP/1.0 {status} ".encode())
+    assert not review_file(built.asset).exists()
+    assert capsys.readouterr().err == ""
+
+
+def test_who_goes_away_is_no_defect(server, capsys):
+    place = urlsplit(server.address)
+    for request in (
+        b"GET /",
+        f"GET {place.path} HTTP/1.1\r\nHost: {place.netloc}\r\n\r\n".encode(),
+    ):
+        said_to(server, request, reset=True)
+    assert asked(server, "GET", place.path)[0] == 200
+    assert capsys.readouterr().err == ""
+
+
+def test_more_connections_than_there_may_be_are_not_asked_for_without_a_pause(server, monkeypatch):
+    paused, tried = [], threading.Event()
+
+    def none_left(_):
+        tried.set()
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(server_module.time, "sleep", paused.append)
+    with monkeypatch.context() as full:
+        full.setattr(server_module.ThreadingHTTPServer, "get_request", none_left)
+        place = urlsplit(server.address)
+        with socket.create_connection((place.hostname, place.port), timeout=200):
+            assert tried.wait(200)
+    assert asked(server, "GET", place.path)[0] == 200
+    assert paused
 
 
 def test_an_address_that_is_taken_is_said(server, built):

@@ -231,9 +231,15 @@ def test_no_sun_is_found_where_none_shines(yard):
     np.testing.assert_allclose(sun, _of_upper_half(SKY), rtol=0.35)
 
 
+@pytest.fixture(scope="module")
+def sun_alone(yard):
+    """The yard under a black sky."""
+    return _lit(yard, Environment(0 * SKY, True).under(SUN))
+
+
 @pytest.mark.parametrize(("stars", "night"), [(0.0, True), (0.005, True), (0.03, False)])
-def test_where_next_to_nothing_shines_the_rest_is_dark_too(yard, stars: float, night: bool):
-    surface, lit, _ = _lit(yard, Environment(0 * SKY, True).under(SUN))
+def test_where_next_to_nothing_shines_the_rest_is_dark_too(sun_alone, stars: float, night: bool):
+    surface, lit, _ = sun_alone
     looked_at = _seen(_UP < 0.3)
     shines = np.random.default_rng(1).random(looked_at.dark.shape) < stars
     dark = looked_at.coverage.measured & ~shines

@@ -49,7 +49,10 @@ def list_of(scans: Sequence[Path], known: Mapping[str, Path] | None = None) -> S
     """The list of these capture folders or main files, each once, with names that depend on their
     places alone and not on their order; a place that is ``known`` keeps its name, and no other gets
     it. UsageError where there are none, InputRefused where one is not there."""
-    places = [*dict.fromkeys(Path(os.path.abspath(scan)) for scan in scans)]
+    once: dict[str, Path] = {}
+    for scan in scans:  # by links, too, as it was named first
+        once.setdefault(os.path.realpath(scan), Path(os.path.abspath(scan)))
+    places = [*once.values()]
     if not places:
         raise UsageError("no scans: name some, or a --list FILE that does. [farm.scans]")
     missing = [place for place in places if not place.exists()]

@@ -234,8 +234,21 @@ def environment_failures(subject: str) -> Iterator[None]:
                 f"{subject}: out of memory. Free some or use a larger machine, then run the same "
                 "command again; finished work is kept. [environment.memory]"
             ) from error
-        where = f" ({error.filename!r})" if error.filename else ""
+        where = f" ({place!r})" if (place := _place_of(error)) else ""
         raise EnvironmentFailure(
             f"{subject}: {error.strerror or error}{where}. Free disk space or correct the "
             "permission, then run the same command again; finished work is kept. [environment.io]"
         ) from error
+
+
+def _place_of(error: OSError) -> object:
+    """Which file an error is about; of one that is temporary, and gone when the message is read,
+    what it was to become, or else the folder that it was in."""
+    ours = f"{TEMPORARY_PREFIX}{_MACHINE}-"
+    places = [place for place in (error.filename, error.filename2) if isinstance(place, str)]
+    for place in places:
+        if ours not in place:
+            return place
+    if not places:
+        return error.filename
+    return places[0].partition(ours)[0].rstrip(os.sep) or os.curdir

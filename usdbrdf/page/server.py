@@ -7,13 +7,17 @@ browser has open, are refused."""
 from __future__ import annotations
 
 import json
+import re
 import secrets
+import sys
 import threading
+import time
 import webbrowser
 from collections.abc import Callable
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.review import judgements_of, write_review
@@ -25,6 +29,23 @@ from usdbrdf.page.report import page, page_data, reviewed
 
 _HOST = "127.0.0.1"
 _LARGEST_REVIEW = 4 << 20  # bytes
+_LENGTH = re.compile("[0-9]{1,7}")  # of a review
+_PAUSE = 0.2  # seconds until the next try where no more connections can be had
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def get_request(self) -> Any:
+        try:
+            return super().get_request()
+        except OSError:  # too many are open: who waits would be asked for again at once
+            time.sleep(_PAUSE)
+            raise
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exc_info()[1], ConnectionError):  # who has gone misses nothing
+            super().handle_error(request, client_address)
 
 
 class PageServer:
@@ -57,10 +78,12 @@ class PageServer:
                 plain = self.headers.get("Content-Type", "") != "application/json"
                 if plain or origin not in (None, own):
                     self._answer(403, b"not from this page")
-                elif not length.isdigit() or int(length) > _LARGEST_REVIEW:
+                elif not _LENGTH.fullmatch(length) or int(length) > _LARGEST_REVIEW:
                     self._answer(413, b"too long")
+                elif len(content := self.rfile.read(int(length))) < int(length):
+                    self._answer(400, b"cut off")
                 else:
-                    self._take(self.rfile.read(int(length)))
+                    self._take(content)
 
             def _take(self, content: bytes) -> None:
                 try:
@@ -95,13 +118,12 @@ class PageServer:
                 """Nothing: addresses hold the token."""
 
         try:
-            self._server = ThreadingHTTPServer((_HOST, port), Handler)
+            self._server = _Server((_HOST, port), Handler)
         except OSError as error:
             raise EnvironmentFailure(
                 f"{_HOST}:{port}: this address cannot be used ({error.strerror}). Choose another "
                 "with --port. [view.port]"
             ) from error
-        self._server.daemon_threads = True
         own = f"http://{_HOST}:{self._server.server_port}"
         self.address = own + at_page
 

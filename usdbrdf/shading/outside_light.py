@@ -140,10 +140,13 @@ def _solved_channel(
     first, every = np.append(0, np.cumsum(size)), np.arange(len(known))
     # A row for each texel: what is done with it then lies together.
     share = np.ascontiguousarray(sources.share.T)
+    by_source, weighted = np.zeros((2, *share.shape))  # their memory is asked for once
+
+    sums = sparse.csr_matrix((np.zeros(len(every)), every, first), (num_segments, len(every)))
 
     def gathered(factor: Double, values: Double) -> Double:
         """(M, ...): sums of factor (N,) times values (N, ...) over the texels of each segment."""
-        sums = sparse.csr_matrix((factor, every, first), (num_segments, len(every)))
+        sums.data[:] = factor  # making another matrix takes longer than the sums
         return np.asarray(sums @ values)
 
     for _ in range(iterations):
@@ -156,15 +159,18 @@ def _solved_channel(
         noise = _noise_of_segments(asked, residual, num_segments)[asked.segment]
         weight = (_FREEDOM + 1) / (_FREEDOM + (residual / noise) ** 2) / noise**2
         weight = weight * effective * counts
-        by_source = share / total[:, None] * np.exp(g)
+        np.divide(share, total[:, None], out=by_source)
+        by_source *= np.exp(g)
         by_albedo, by_gloss = scattered / total, over_albedo * mirrored / total
         rows = num_sources + 2 * num_segments + 1
         curvature, gradient = np.zeros((rows, rows)), np.zeros(rows)
-        weighted = by_source * np.sqrt(weight)[:, None]
+        np.multiply(by_source, np.sqrt(weight)[:, None], out=weighted)
         curvature[:num_sources, :num_sources] = weighted.T @ weighted
         gradient[:num_sources] = (weight * residual) @ by_source
         parts = by_albedo * weight, by_gloss * weight
         for place, part in zip((of_albedo, of_gloss), parts, strict=True):
+            if not part.any():  # nothing is mirrored
+                continue
             both = gathered(part, by_source)
             curvature[place, :num_sources], curvature[:num_sources, place] = both, both.T
             gradient[place] = gathered(part, residual)
@@ -197,10 +203,10 @@ def _noise_of_segments(asked: Asked, residual: Double, count: int) -> Double:
 
 def medians_of_segments(values: Double, segment: Int, count: int) -> Double:
     """(M,) of values (N,) those of each segment; of one without any that of all."""
-    middle = np.full(count, np.median(values))
     # One sort is much faster than a median of each.
     ordered, size = values[np.lexsort((values, segment))], np.bincount(segment, minlength=count)
     has = size > 0
+    middle = np.full(count, 0.0 if has.all() else np.median(values))
     first = (np.cumsum(size) - size)[has]
     lower, upper = first + (size[has] - 1) // 2, first + size[has] // 2
     middle[has] = (ordered[lower] + ordered[upper]) / 2

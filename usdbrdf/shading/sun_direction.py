@@ -47,6 +47,7 @@ def find_sun(
         """(M,) of the best strength in each direction."""
         cosine = np.maximum(directions @ normal.T, 0)
         rays = np.repeat(directions.astype(np.float32), len(origin), axis=0)
+        rays[cosine.ravel() == 0] = 0  # what looks away need not be traced
         free = surface.rays.closest(origin, rays).face < 0
         share = cosine * free.reshape(cosine.shape)
         return _costs(reflected, without, share, asked.clipped, first, strengths)
@@ -101,18 +102,38 @@ def _costs(
     count, points = share.shape
     best = np.empty(count)
     rest = np.empty(points)
+    # What a segment costs without the sun, of which its texels see nothing in many directions.
+    dark, cost_in_dark = reflected - np.log(without), np.empty(points)
+    for k in range(len(first) - 1):
+        low, high = first[k], first[k + 1]
+        _cost_of_each(dark[low:high], clipped[low:high], cost_in_dark[low:high])
+    cost = np.empty(points)
     for m in range(count):
         best[m] = np.inf
         for strength in strengths:
             total = 0.0
             for k in range(len(first) - 1):
                 low, high = first[k], first[k + 1]
+                sees = False
                 for i in range(low, high):
-                    rest[i] = reflected[i] - np.log(without[i] + strength * share[m, i])
-                middle = np.median(rest[low:high])
+                    rest[i] = dark[i]
+                    if share[m, i] > 0:
+                        sees = True
+                        rest[i] = reflected[i] - np.log(without[i] + strength * share[m, i])
+                if sees:
+                    _cost_of_each(rest[low:high], clipped[low:high], cost[low:high])
                 for i in range(low, high):
-                    off = rest[i] - middle
-                    if not (clipped[i] and off < 0):
-                        total += min(abs(off), _OUTLIER)
+                    total += cost[i] if sees else cost_in_dark[i]
+                if total / points >= best[m]:  # it only grows
+                    break
             best[m] = min(best[m], total / points)
     return best
+
+
+@loop
+def _cost_of_each(rest: Double, clipped: Bool, cost: Double) -> None:
+    """Fill in the cost (n,) of each texel of a segment."""
+    middle = np.median(rest)
+    for i in range(len(rest)):
+        off = rest[i] - middle
+        cost[i] = 0.0 if clipped[i] and off < 0 else min(abs(off), _OUTLIER)

@@ -14,7 +14,13 @@ from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import LIGHTING, ROLES, Asset
 from usdbrdf.asset.manifest import refuse_converted
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.readers.tried import TIMEOUT_S, look_through, refuse_special, try_layers
+from usdbrdf.asset.readers.tried import (
+    TIMEOUT_S,
+    look_through,
+    refuse_special,
+    refuse_special_behind,
+    try_layers,
+)
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.job.child import run_child
@@ -132,6 +138,7 @@ def try_in_child(layer: Path, *, composes: bool = True, beside: Sequence[Path] =
 
 def open_in_child(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
     """The child's part of ``try_in_child``."""
+    refuse_special_behind(parameters["layer"])
     if parameters["composes"]:
         open_stage(Path(parameters["layer"]))
     else:

@@ -55,6 +55,8 @@ def try_layers(files: Sequence[Path], *, together: bool = False) -> None:
 def look_in_child(_arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
     """The child's part of ``try_layers``."""
     if parameters["together"]:
+        for file in parameters["layers"]:
+            refuse_special_behind(file)
         root = Sdf.Layer.CreateAnonymous(".usda")
         root.subLayerPaths = parameters["layers"]
         with suppress(Tf.ErrorException):
@@ -82,6 +84,25 @@ def refuse_special(folder: Path) -> None:
     places = folder, folder / "layers", *folder.glob("objects/*")
     for place in (place for place in places if place.is_dir()):
         _refuse_special([file for file in place.iterdir() if file.suffix in _ENDINGS])
+
+
+def refuse_special_behind(layer: str) -> None:
+    """The same for whatever a layer names as a part of its stage, wherever that lies: the layers
+    are opened one by one, so this is for a child."""
+    waiting, seen, kept = [layer], {layer}, []
+    while waiting:
+        found = None
+        with suppress(Tf.ErrorException):  # which whoever composes the stage will say
+            found = Sdf.Layer.FindOrOpen(waiting.pop())
+        if found is None:
+            continue
+        kept.append(found)  # or it would be read again
+        for name in found.GetCompositionAssetDependencies():
+            place, _ = Sdf.Layer.SplitIdentifier(found.ComputeAbsolutePath(name))
+            if place not in seen:
+                _refuse_special([Path(place)])
+                seen.add(place)
+                waiting.append(place)
 
 
 def _refuse_special(files: Sequence[Path]) -> None:
