@@ -15,6 +15,8 @@ from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
 from tests.json_schemas import check
+from usdbrdf.asset.header import read_header
+from usdbrdf.asset.layers.scan_layer import write_pending_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
 from usdbrdf.asset.readers import tried
@@ -50,7 +52,7 @@ def test_a_version_needs_nothing_else_and_is_what_the_asset_was(room, tmp_path):
     here = surfaces_of(stage_in_look(room.asset, "shaded"))
     told = publish(room.asset.folder, tmp_path / "dest")
     check(told, "publish")
-    assert (told["version"], told["new"]) == ("v001", True)
+    assert (told["version"], told["new"], told["unfinished"]) == ("v001", True, [])
     shutil.move(tmp_path / "dest/v001", moved := tmp_path / "elsewhere")
     shutil.rmtree(room.asset.folder)
     shutil.rmtree(tmp_path / "capture")
@@ -174,6 +176,25 @@ def test_neither_half_a_run_nor_into_a_file(room, tmp_path):
     finally:
         journal.unlink()
     assert not (tmp_path / "dest").exists()
+
+
+def test_an_asset_without_all_steps_only_if_asked_for(room, tmp_path):
+    """As one whose convert was stopped after it had textured: its materials would be grey for
+    good, and nobody would be told."""
+    asset, dest = room.asset, tmp_path / "dest"
+    header = read_header(asset.layer("scan"))
+    write_pending_layer(asset.layer("material"), "material", header)
+    with pytest.raises(InputRefused, match=r"the step fit was not run.+\[publish\.unfinished\]$"):
+        publish(asset.folder, dest)
+    assert not dest.exists()
+    write_pending_layer(asset.layer("shading"), "shading", header)
+    with pytest.raises(InputRefused, match=r"the steps shade and fit were not run"):
+        publish(asset.folder, dest)
+    told = publish(asset.folder, dest, PublishOptions(unfinished=True))
+    check(told, "publish")
+    assert told["unfinished"] == ["shade", "fit"]
+    said = Sdf.Layer.FindOrOpen(str(dest / "v001/room.usd")).documentation
+    assert said.endswith("It is unfinished: the steps shade and fit were not run.")
 
 
 def test_neither_what_was_changed_by_hand_nor_steps_of_two_runs(room, tmp_path):

@@ -18,7 +18,7 @@ from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layers.interface import UNPUBLISHED
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
-from usdbrdf.asset.readers.compose import open_edited, outdated_steps
+from usdbrdf.asset.readers.compose import not_run, open_edited, outdated_steps, steps_to_come
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
@@ -68,7 +68,7 @@ def publish(
             "another place. [publish.destination]"
         )
     with reading(asset.folder, wait_s=wait_s):
-        _refuse_unsound(asset)
+        _refuse_unsound(asset, options)
         lock = destination / _LOCKED
         with environment_failures(str(destination)), _made(destination):
             lock.mkdir(exist_ok=True)
@@ -76,9 +76,9 @@ def publish(
                 return _published(asset, destination, options)
 
 
-def _refuse_unsound(asset: Asset) -> None:
+def _refuse_unsound(asset: Asset, options: PublishOptions) -> None:
     """OwnershipConflict for files that somebody changed by hand; InputRefused for steps that were
-    run after those that build on them."""
+    run after those that build on them, and for those that were not run, unless asked for."""
     if edited := edited_files(asset.folder):
         raise OwnershipConflict(
             f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run `usdbrdf "
@@ -89,6 +89,12 @@ def _refuse_unsound(asset: Asset) -> None:
         raise InputRefused(
             f"{asset.folder}: {'; '.join(old)}. Run `usdbrdf convert` again, which brings all "
             "steps up to date, and publish then. [publish.outdated]"
+        )
+    if (missing := steps_to_come(asset)) and not options.unfinished:
+        raise InputRefused(
+            f"{asset.folder}: {not_run(missing)}, so what others take in would lack its measured "
+            "materials for good. Run `usdbrdf convert`, which goes on from there, or publish it as "
+            "it is with --unfinished. [publish.unfinished]"
         )
 
 
@@ -118,7 +124,7 @@ def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict
     with temporary_folder(destination / _LOCKED / _STAGED / version) as staged:
         manifest = _write(asset, staged, version, options)
         if earlier and manifest.content == _content_of(like):
-            return _summary(like, read_manifest(like), new=False)
+            return _summary(asset, like, read_manifest(like), new=False)
         if version in earlier:
             raise OwnershipConflict(
                 f"{final}: this version is there and holds something else. Versions never change: "
@@ -127,7 +133,7 @@ def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict
         for file in (each for each in staged.rglob("*") if each.is_file()):
             file.chmod(file.stat().st_mode & 0o444)
         publish_folder(staged, final)
-    return _summary(final, manifest, new=True)
+    return _summary(asset, final, manifest, new=True)
 
 
 def versions_in(destination: Path) -> list[str]:
@@ -164,12 +170,12 @@ def _content_of(version: Path) -> str:
 def _write(asset: Asset, folder: Path, version: str, options: PublishOptions) -> Manifest:
     root, space = f"{asset.name}.usd", SPACES[options.texture_space]
     identifier = _identifier(options.uri, asset.name, version) or f"./{root}"
-    components = _unpublished(asset)
+    components, missing = _unpublished(asset), steps_to_come(asset)
     said = hashlib.sha256(f"{options.encoding}\0{options.uri}\0{space}\0".encode())
 
     def describe(layer: Sdf.Layer) -> None:
         said.update(layer.ExportToString().encode())
-        _describe(layer, asset.name, version, identifier)
+        _describe(layer, asset.name, version, identifier, missing)
         for path in components:
             _tell(Sdf.CreatePrimInLayer(layer, path), version=version)
 
@@ -250,17 +256,19 @@ def _tell(prim: Sdf.PrimSpec, **info: object) -> None:
     prim.SetInfo("assetInfo", {**known, **info})
 
 
-def _describe(layer: Sdf.Layer, name: str, version: str, identifier: str) -> None:
+def _describe(
+    layer: Sdf.Layer, name: str, version: str, identifier: str, missing: list[str]
+) -> None:
     """What the root layer of a version says of it."""
     layer.documentation = (
         "A published version, which never changes. Reference it, or put opinions into a layer of "
         "your own above it."
-    )
+    ) + (f" It is unfinished: {not_run(missing)}." if missing else "")
     root = Sdf.CreatePrimInLayer(layer, f"/{layer.defaultPrim}")
     _tell(root, identifier=Sdf.AssetPath(identifier), name=name, version=version)
 
 
-def _summary(version: Path, manifest: Manifest, *, new: bool) -> dict[str, Any]:
+def _summary(asset: Asset, version: Path, manifest: Manifest, *, new: bool) -> dict[str, Any]:
     size = sum((version / path).stat().st_size for path in manifest.files)
     return {
         "publish": str(version),
@@ -269,5 +277,6 @@ def _summary(version: Path, manifest: Manifest, *, new: bool) -> dict[str, Any]:
         "texture_space": manifest.texture_space,
         "files": len(manifest.files),
         "bytes": size,
+        "unfinished": steps_to_come(asset),
         "new": new,
     }

@@ -10,7 +10,7 @@ from typing import Any
 
 from pxr import Sdf, Tf, Usd, UsdUtils
 
-from usdbrdf.asset.header import Provenance, new_layer, read_header
+from usdbrdf.asset.header import Provenance, new_layer, read_header, read_provenance
 from usdbrdf.asset.layout import LIGHTING, ROLES, Asset
 from usdbrdf.asset.manifest import refuse_converted
 from usdbrdf.asset.maps import AssetMaps
@@ -242,6 +242,24 @@ def outdated_steps(asset: Asset) -> list[str]:
             if layer.parent == folder and layer.is_file() and sha256_of(layer) != sha256:
                 found.append(f"{stamp.stage} was made with another {name}")  # type: ignore[union-attr]
     return found
+
+
+def steps_to_come(asset: Asset) -> list[str]:
+    """Which steps have not been run, in any or one of the lightings, in their order."""
+    found = []
+    for step, role in zip(("texture", "shade", "fit"), ROLES[1:], strict=True):
+        layers = {one.layer(role) for one in (asset, *asset.in_each_lighting)}
+        records = [read_provenance(layer) for layer in layers if layer.is_file()]
+        if any(record.get("state") == "pending" for record in records):
+            found.append(step)
+    return found
+
+
+def not_run(steps: Sequence[str]) -> str:
+    """What is to be said of them, in words."""
+    if len(steps) == 1:
+        return f"the step {steps[0]} was not run"
+    return f"the steps {', '.join(steps[:-1])} and {steps[-1]} were not run"
 
 
 def _beneath(asset: Asset) -> list[Path]:
