@@ -413,9 +413,20 @@ def test_names_for_a_resolver(room, tmp_path):
     stage = Usd.Stage.Open(str(root))
     info = stage.GetDefaultPrim().GetAssetInfo()
     assert info["identifier"].path == told["identifier"]
+    assert own_findings(stage) == []  # who asked for the address need not be warned of it
     for bad in ("room/{version}", "ayon+entity://{shot}", "ayon+entity://{", "a://{0}"):
         with pytest.raises(UsageError, match=r"publish\.uri"):
             publish(room.asset.folder, tmp_path / "dest", PublishOptions(uri=bad))
+
+
+def test_a_reference_that_no_resolver_knows_is_told_as_such(room, tmp_path):
+    edit(
+        room, 'over "room" { def Xform "guest" (prepend references = @ayon+entity://a?b=c@ ) { } }'
+    )
+    with pytest.raises(
+        InputRefused, match=r"an address: run usdbrdf where the resolver that knows"
+    ):
+        publish(room.asset.folder, tmp_path / "dest")
 
 
 def test_equal_assets_give_equal_bytes(room, tmp_path):

@@ -136,9 +136,12 @@ def anchored_path(scene: AssetStage) -> Iterator[Fault]:
     file.
 
     Bring the file into the asset's folder and name it relative to the layer."""
+    known = scene.root_prim.GetAssetInfoByKey("identifier") if scene.root_prim else None
     for layer, path, value in scene.asset_paths if scene.asset else ():
         site, said = _site(scene.stage, layer, path), f"@{value}@ in @{layer.realPath}@"
         if _URI.match(value):
+            if isinstance(known, Sdf.AssetPath) and value == known.path:
+                continue  # by which others find the asset, and nothing of it
             problem = f"{said} is for a resolver that others may not have."
             yield Fault(site, problem, severity=Severity.WARNING)
         elif not value.startswith(("./", "../")):

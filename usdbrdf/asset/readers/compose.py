@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
@@ -25,6 +26,8 @@ from usdbrdf.options import NO_LIGHT, Surroundings
 from usdbrdf.untrusted.usd_paths import words_of
 
 _MAX_LENGTH = 600
+# An asset path with a scheme, as USD's messages spell it.
+_ADDRESS = re.compile(r"@[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 def in_one_line(error: object) -> str:
@@ -159,9 +162,14 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
             "earlier copy of it. [stage.open]"
         ) from error
     if problems:
+        cure = "Correct that layer, or bring back the file that it names."
+        if _ADDRESS.search(problems[0]):
+            cure = (
+                "That is an address: run usdbrdf where the resolver that knows it is set up "
+                "(PXR_PLUGINPATH_NAME), or name a file."
+            )
         raise InputRefused(
-            f"{subject}: the stage does not compose: {problems[0]}. Correct that layer, or bring "
-            "back the file that it names. [stage.open]"
+            f"{subject}: the stage does not compose: {problems[0]}. {cure} [stage.open]"
         )
     return stage
 
