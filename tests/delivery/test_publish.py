@@ -24,7 +24,7 @@ from usdbrdf.asset.review import write_review
 from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.delivery.publish import publish, versions_in
 from usdbrdf.errors import FolderBusy, InputRefused, OwnershipConflict, UsageError
-from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.atomic import make_folders, sha256_of
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import Stamp, stamp_path, write_stamp
@@ -255,6 +255,41 @@ def test_one_at_a_time(room, tmp_path):
     finally:
         done.set()
         holder.join()
+
+
+def test_a_folder_that_another_has_just_made_is_left_to_it(room, tmp_path, monkeypatch):
+    """Of two publishes that began at once neither wrote anything: the one that was refused took
+    the other's folder away."""
+    dest = tmp_path / "a/dest"
+    lock = dest / ".usdbrdf-publish"
+    entered, fail = threading.Event(), threading.Event()
+
+    def other():
+        with folder_lock(lock):
+            entered.set()
+            fail.wait(600)
+            shutil.rmtree(tmp_path / "a")  # as one that fails does
+
+    holder = threading.Thread(target=other)
+
+    def made_by_both(folder):
+        make_folders(folder)
+        if not entered.is_set():
+            lock.mkdir()
+            holder.start()
+            entered.wait(600)
+
+    monkeypatch.setattr("usdbrdf.delivery.publish.make_folders", made_by_both)
+    try:
+        with pytest.raises(FolderBusy, match=r"lock\.busy"):
+            publish(room.asset.folder, dest)
+        assert lock.is_dir()
+        threading.Timer(0.2, fail.set).start()
+        assert publish(room.asset.folder, dest, wait_s=60)["version"] == "v001"
+    finally:
+        fail.set()
+        holder.join()
+    assert sorted(os.listdir(dest)) == [".usdbrdf-publish", "v001"]
 
 
 def test_nothing_is_made_of_an_asset_in_which_a_run_works(room, tmp_path):

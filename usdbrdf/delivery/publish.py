@@ -7,8 +7,8 @@ import hashlib
 import re
 import shutil
 import string
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manif
 from usdbrdf.asset.readers.compose import not_run, open_edited, outdated_steps, steps_to_come
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
-from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
+from usdbrdf.errors import InputRefused, NoLocks, OwnershipConflict, UsageError
 from usdbrdf.files.atomic import (
     environment_failures,
     make_folders,
@@ -69,11 +69,11 @@ def publish(
         )
     with reading(asset.folder, wait_s=wait_s):
         _refuse_unsound(asset, options)
-        lock = destination / _LOCKED
-        with environment_failures(str(destination)), _made(destination):
-            lock.mkdir(exist_ok=True)
-            with folder_lock(lock, wait_s, without_lock=without_lock):
-                return _published(asset, destination, options)
+        with (
+            environment_failures(str(destination)),
+            _locked(destination, wait_s, without_lock=without_lock),
+        ):
+            return _published(asset, destination, options)
 
 
 def _refuse_unsound(asset: Asset, options: PublishOptions) -> None:
@@ -99,18 +99,37 @@ def _refuse_unsound(asset: Asset, options: PublishOptions) -> None:
 
 
 @contextmanager
-def _made(destination: Path) -> Iterator[None]:
-    """The folder, made; gone again where nothing was published into it."""
-    new = [f for f in (destination, *destination.parents) if not f.exists()]
-    make_folders(destination)
-    try:
-        yield
-    except BaseException:
-        if new and {entry.name for entry in destination.iterdir()} <= {_LOCKED}:
-            shutil.rmtree(destination / _LOCKED, ignore_errors=True)
+def _locked(destination: Path, wait_s: float, *, without_lock: bool) -> Iterator[None]:
+    """The folder, made, and nobody else publishing into it; gone again where nothing was published
+    into it, while it is still held: who waits for it makes it anew."""
+    lock, new = destination / _LOCKED, list[Path]()
+    with ExitStack() as held:
+        while True:
+            new = [f for f in (destination, *destination.parents) if f in new or not f.exists()]
+            make_folders(destination)
+            try:
+                lock.mkdir(exist_ok=True)
+                held.enter_context(folder_lock(lock, wait_s, without_lock=without_lock))
+                break
+            except FileNotFoundError:
+                continue  # another publish failed, and took the folder away
+            except NoLocks:
+                _remove_unused(destination, new)
+                raise
+        try:
+            yield
+        except BaseException:
+            _remove_unused(destination, new)
+            raise
+
+
+def _remove_unused(destination: Path, new: Iterable[Path]) -> None:
+    """Folders that were made for what was not published then, the innermost first."""
+    if new and {entry.name for entry in destination.iterdir()} <= {_LOCKED}:
+        shutil.rmtree(destination / _LOCKED, ignore_errors=True)
+        with suppress(OSError):  # others have put something there meanwhile
             for place in new:
                 place.rmdir()
-        raise
 
 
 def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict[str, Any]:
