@@ -40,6 +40,8 @@ def test_objects_by_status_and_what_needs_a_look():
     assert "79% of the texels measured, 0.2% clipped in every frame" in text
     assert any(line.split() == ["warnings", *line.split()[1:]] and " 2," in line for line in lines)
     assert lines[-2].endswith("usdbrdf report out/room -o out/room.html")
+    spaced = table(STEPS, Path("our room/it.usda"))[-2]
+    assert spaced.endswith("usdbrdf report 'our room' -o 'our room.html'")
     assert lines[-1].split() == ["stage", str(ROOT)]
 
 

@@ -444,6 +444,8 @@ class PublishOptions(Options):
     as 'ayon+entity://show/assets?product={{name}}&version={{version}}'"""
     photographs: bool = option("--no-photographs", True)
     "leave the photographs out; else they are copied without EXIF, GPS and the like"
+    unfinished: bool = option("--unfinished", False)
+    "publish an asset in which not all steps were run, too; the version says which were not"
     texture_space: TextureSpace = _texture_space()
     proxies: int | None = option("--proxies N", None, _COUNT, unset="none")
     """stand-ins of about N triangles in all: purpose proxy, the measured meshes get purpose

@@ -3,6 +3,7 @@ alone, those that ``--json`` prints."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,9 @@ def table(steps: Mapping[str, Mapping[str, Any]], root: Path) -> list[str]:
     doubts = sum(len(step.get("warnings", ())) for step in steps.values())
     if doubts:
         rows.append(("warnings", f"{doubts}, told above as they came; --json lists them"))
-    rows.append(("page", f"usdbrdf report {root.parent} -o {root.parent}.html"))
+    rows.append(
+        ("page", shlex.join(["usdbrdf", "report", str(root.parent), "-o", f"{root.parent}.html"]))
+    )
     rows.append(("stage", str(root)))
     width = max(len(name) for name, _ in rows)
     before = ["", *(name for name, _ in rows)]

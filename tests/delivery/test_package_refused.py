@@ -7,12 +7,14 @@ import resource
 
 import numpy as np
 import pytest
-from pxr import Sdf
+from pxr import Sdf, Usd
 
 from tests.delivery.packing import CHAIR_FILE, edit, packed
 from usdbrdf.delivery.package import look_of, package, stage_in_look, write_usdz
+from usdbrdf.delivery.publish import publish
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
-from usdbrdf.files.images import write_exr
+from usdbrdf.files.images import write_exr, write_preview_png
+from usdbrdf.validation.validate import own_findings
 
 
 @pytest.mark.fault("S2")
@@ -90,6 +92,22 @@ def test_what_is_no_picture_is_refused(room, tmp_path, path, code):
     edit(room, CHAIR_FILE.format(path))
     with pytest.raises(InputRefused, match=code):
         packed(room, tmp_path)
+
+
+def test_pictures_that_are_not_what_their_names_say_are_refused(room, tmp_path):
+    """It was said that the disk is full."""
+    write_preview_png(tmp_path / "x.png", np.full((2, 3, 3), 99, np.uint8))
+    (tmp_path / "x.png").rename(room.asset.folder / "x.exr")
+    edit(room, CHAIR_FILE.format("./x.exr"))
+    with pytest.raises(InputRefused, match=r"x\.exr: it holds .+ called \.exr.+image\.name\]$"):
+        packed(room, tmp_path)
+    with pytest.raises(InputRefused, match=r"image\.name\]$"):
+        packed(room, tmp_path, whole=True)
+    with pytest.raises(InputRefused, match=r"image\.name\]$"):
+        publish(room.asset.folder, tmp_path / "dest")
+    [found] = own_findings(Usd.Stage.Open(str(room.asset.root_layer)))
+    assert (found.rule, found.severity.name) == ("usdbrdf.UnreadableTexture", "ERROR")
+    assert "Rename it" in found.message
 
 
 def test_an_asset_of_which_nothing_is_measured_yet(synthetic, tmp_path):

@@ -7,6 +7,8 @@ import pytest
 from pxr import Usd, UsdShade
 
 from tests.delivery.packing import extracted, members, packed, surfaces_of
+from usdbrdf.asset.header import read_header
+from usdbrdf.asset.layers.scan_layer import write_pending_layer
 from usdbrdf.delivery.package import stage_in_look
 from usdbrdf.errors import UsageError
 
@@ -50,3 +52,12 @@ def test_no_node_is_read_by_nobody(room):
     }
     assert nodes
     assert [prim.GetPath() for prim in nodes if prim not in sources] == []
+
+
+def test_a_package_of_an_unfinished_asset_says_so(room, tmp_path, capsys):
+    layer = room.asset.layer("material")
+    write_pending_layer(layer, "material", read_header(room.asset.layer("scan")))
+    for options in ({"whole": True}, {"look": "lit"}):
+        packed(room, tmp_path, **options)
+        said = capsys.readouterr().err
+        assert "room.usdz: the step fit was not run; the package lacks what" in said

@@ -15,6 +15,8 @@ from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
 from tests.json_schemas import check
+from usdbrdf.asset.header import read_header
+from usdbrdf.asset.layers.scan_layer import write_pending_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
 from usdbrdf.asset.readers import tried
@@ -22,7 +24,7 @@ from usdbrdf.asset.review import write_review
 from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.delivery.publish import publish, versions_in
 from usdbrdf.errors import FolderBusy, InputRefused, OwnershipConflict, UsageError
-from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.atomic import make_folders, sha256_of
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import Stamp, stamp_path, write_stamp
@@ -50,7 +52,7 @@ def test_a_version_needs_nothing_else_and_is_what_the_asset_was(room, tmp_path):
     here = surfaces_of(stage_in_look(room.asset, "shaded"))
     told = publish(room.asset.folder, tmp_path / "dest")
     check(told, "publish")
-    assert (told["version"], told["new"]) == ("v001", True)
+    assert (told["version"], told["new"], told["unfinished"]) == ("v001", True, [])
     shutil.move(tmp_path / "dest/v001", moved := tmp_path / "elsewhere")
     shutil.rmtree(room.asset.folder)
     shutil.rmtree(tmp_path / "capture")
@@ -176,6 +178,25 @@ def test_neither_half_a_run_nor_into_a_file(room, tmp_path):
     assert not (tmp_path / "dest").exists()
 
 
+def test_an_asset_without_all_steps_only_if_asked_for(room, tmp_path):
+    """As one whose convert was stopped after it had textured: its materials would be grey for
+    good, and nobody would be told."""
+    asset, dest = room.asset, tmp_path / "dest"
+    header = read_header(asset.layer("scan"))
+    write_pending_layer(asset.layer("material"), "material", header)
+    with pytest.raises(InputRefused, match=r"the step fit was not run.+\[publish\.unfinished\]$"):
+        publish(asset.folder, dest)
+    assert not dest.exists()
+    write_pending_layer(asset.layer("shading"), "shading", header)
+    with pytest.raises(InputRefused, match=r"the steps shade and fit were not run"):
+        publish(asset.folder, dest)
+    told = publish(asset.folder, dest, PublishOptions(unfinished=True))
+    check(told, "publish")
+    assert told["unfinished"] == ["shade", "fit"]
+    said = Sdf.Layer.FindOrOpen(str(dest / "v001/room.usd")).documentation
+    assert said.endswith("It is unfinished: the steps shade and fit were not run.")
+
+
 def test_neither_what_was_changed_by_hand_nor_steps_of_two_runs(room, tmp_path):
     """Also by a user who cannot write into the asset: nothing is asked of the folder's rights."""
     folder, dest = room.asset.folder, tmp_path / "dest"
@@ -234,6 +255,41 @@ def test_one_at_a_time(room, tmp_path):
     finally:
         done.set()
         holder.join()
+
+
+def test_a_folder_that_another_has_just_made_is_left_to_it(room, tmp_path, monkeypatch):
+    """Of two publishes that began at once neither wrote anything: the one that was refused took
+    the other's folder away."""
+    dest = tmp_path / "a/dest"
+    lock = dest / ".usdbrdf-publish"
+    entered, fail = threading.Event(), threading.Event()
+
+    def other():
+        with folder_lock(lock):
+            entered.set()
+            fail.wait(600)
+            shutil.rmtree(tmp_path / "a")  # as one that fails does
+
+    holder = threading.Thread(target=other)
+
+    def made_by_both(folder):
+        make_folders(folder)
+        if not entered.is_set():
+            lock.mkdir()
+            holder.start()
+            entered.wait(600)
+
+    monkeypatch.setattr("usdbrdf.delivery.publish.make_folders", made_by_both)
+    try:
+        with pytest.raises(FolderBusy, match=r"lock\.busy"):
+            publish(room.asset.folder, dest)
+        assert lock.is_dir()
+        threading.Timer(0.2, fail.set).start()
+        assert publish(room.asset.folder, dest, wait_s=60)["version"] == "v001"
+    finally:
+        fail.set()
+        holder.join()
+    assert sorted(os.listdir(dest)) == [".usdbrdf-publish", "v001"]
 
 
 def test_nothing_is_made_of_an_asset_in_which_a_run_works(room, tmp_path):
@@ -392,9 +448,20 @@ def test_names_for_a_resolver(room, tmp_path):
     stage = Usd.Stage.Open(str(root))
     info = stage.GetDefaultPrim().GetAssetInfo()
     assert info["identifier"].path == told["identifier"]
+    assert own_findings(stage) == []  # who asked for the address need not be warned of it
     for bad in ("room/{version}", "ayon+entity://{shot}", "ayon+entity://{", "a://{0}"):
         with pytest.raises(UsageError, match=r"publish\.uri"):
             publish(room.asset.folder, tmp_path / "dest", PublishOptions(uri=bad))
+
+
+def test_a_reference_that_no_resolver_knows_is_told_as_such(room, tmp_path):
+    edit(
+        room, 'over "room" { def Xform "guest" (prepend references = @ayon+entity://a?b=c@ ) { } }'
+    )
+    with pytest.raises(
+        InputRefused, match=r"an address: run usdbrdf where the resolver that knows"
+    ):
+        publish(room.asset.folder, tmp_path / "dest")
 
 
 def test_equal_assets_give_equal_bytes(room, tmp_path):

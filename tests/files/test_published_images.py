@@ -6,7 +6,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from usdbrdf.files.images import read_exr
+from usdbrdf.files.images import open_image, read_exr
 from usdbrdf.files.published_images import copy_without_metadata, write_texture
 
 SECRETS = {
@@ -117,3 +117,16 @@ def test_names_of_attributes_that_are_no_words_go_too(tmp_path, name):
     copy_without_metadata(tmp_path / "a.exr", tmp_path / "b.exr")
     assert name + b"\0" not in (tmp_path / "b.exr").read_bytes()
     assert read_exr(tmp_path / "b.exr").shape == (8, 8, 3)
+
+
+@pytest.mark.parametrize(("kind", "called"), [("png", "jpg"), ("jpg", "png"), ("tif", "png")])
+def test_what_is_called_otherwise_loses_its_metadata_all_the_same(tmp_path, kind, called):
+    """Photographs are what telephones and chats call them; it was said that the disk is full."""
+    photograph(tmp_path / f"a.{kind}")
+    (tmp_path / f"a.{kind}").rename(source := tmp_path / f"a.{called}")
+    copy_without_metadata(source, target := tmp_path / f"b.{called}")
+    assert b"Jane Roe" in source.read_bytes()
+    assert b"Jane Roe" not in target.read_bytes()
+    kinds = [open_image(file).format_name() for file in (source, target)]
+    assert kinds[0] == kinds[1]
+    assert {*tmp_path.iterdir()} == {source, target}

@@ -53,6 +53,12 @@ class Collection:
     named_by: dict[Path, set[str]] = field(default_factory=lambda: defaultdict(set))
     photographs: set[Path] = field(default_factory=set)
 
+    @property
+    def own(self) -> frozenset[Path]:
+        """Files that are no layers and lie in the asset's folder: its maps, and an artist's."""
+        home = os.path.realpath(self.asset.folder)
+        return frozenset(f for f in self.named_by if f.is_relative_to(home)) - self.photographs
+
 
 def collected(asset: Asset, root: str, *, photographs: bool) -> Collection:
     """The asset as everybody opens it, all variants, the artist's edits included.

@@ -27,7 +27,13 @@ from usdbrdf.delivery.colours import ColourTextures, convert_layer, converted_te
 from usdbrdf.delivery.proxies import add_proxies
 from usdbrdf.files.colour import ACESCG, WORKING_SPACE
 from usdbrdf.files.images import needs_float, write_exr
-from usdbrdf.files.published_images import copy_without_metadata, write_texture
+from usdbrdf.files.published_images import (
+    CLEANED,
+    copy_without_metadata,
+    misnamed,
+    refuse_misnamed,
+    write_texture,
+)
 
 SPACES = {"rec709": WORKING_SPACE, "acescg": ACESCG}
 # Attributes that name textures which renderers look up on surfaces, from near and from afar.
@@ -73,6 +79,8 @@ def write_copy(
     found = collected(asset, root, photographs=photographs)
     for file in found.named_by:
         accept(file)
+        if file in found.own and not asset.is_published and file.suffix.lower() in CLEANED:
+            refuse_misnamed(file)
 
     def edit(layer: Sdf.Layer, is_root: bool) -> bool:
         changed = space != WORKING_SPACE and convert_layer(layer, textures, space)
@@ -86,7 +94,8 @@ def write_copy(
     def write(file: Path, place: Path) -> None:
         named = found.named_by[file]
         converted = converted_texture(file, space) if file in textures.files else None
-        if file.suffix.lower() == ".exr" and any(_TEXTURES.fullmatch(name) for name in named):
+        sound = file.suffix.lower() == ".exr" and not misnamed(file)
+        if sound and any(_TEXTURES.fullmatch(name) for name in named):
             write_texture(place, file, converted=converted, encoding=space)
         elif converted is not None:
             write_exr(place, converted, half=not needs_float(converted), encoding=space)

@@ -24,7 +24,14 @@ from usdbrdf.asset.layers.interface import UNPUBLISHED
 from usdbrdf.asset.layers.lights_layer import DAYLIGHT, EMISSIVE, LIGHTS, USDLUX
 from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.compose import in_one_line, named_files, open_edited, open_weaker
+from usdbrdf.asset.readers.compose import (
+    in_one_line,
+    named_files,
+    not_run,
+    open_edited,
+    open_weaker,
+    steps_to_come,
+)
 from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
 from usdbrdf.delivery.collection import OF_PHOTOGRAPHS, SCHEMAS_OF_PHOTOGRAPHS
 from usdbrdf.delivery.colours import ColourTextures, convert_layer, in_space
@@ -259,7 +266,10 @@ def package(folder: Path, output: Path, options: PackageOptions | None = None) -
     Raises UsageError for options that exclude each other, and InputRefused where the asset names
     files outside of its folder.
     """
-    return write_package(folder, output, options or PackageOptions(), warn)
+    summary = write_package(folder, output, options or PackageOptions(), warn)
+    if missing := steps_to_come(Asset.made(folder)):
+        warn(f"{output}: {not_run(missing)}; the package lacks what they measure.")
+    return summary
 
 
 def write_package(

@@ -18,7 +18,7 @@ from usdbrdf.asset.readers.surfaces import is_srgb, read_texture
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import WORKING_SPACE, to_display_srgb8
 from usdbrdf.files.images import image_size, read_exr, resized, write_exr, write_preview_png
-from usdbrdf.files.published_images import copy_without_metadata, write_texture
+from usdbrdf.files.published_images import copy_without_metadata, refuse_misnamed, write_texture
 from usdbrdf.model.arrays import Byte, Float
 
 Types = Sdf.ValueTypeNames
@@ -196,6 +196,7 @@ def checked_size(file: Path) -> tuple[int, int, tuple[str, ...]]:
             f"{file}: packages are made of {known} only. Convert it, or take it out of edits.usda. "
             "[package.format]"
         )
+    refuse_misnamed(file)
     return image_size(file)  # refuses what only has the name of a picture
 
 

@@ -7,8 +7,8 @@ import hashlib
 import re
 import shutil
 import string
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,10 @@ from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layers.interface import UNPUBLISHED
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
-from usdbrdf.asset.readers.compose import open_edited, outdated_steps
+from usdbrdf.asset.readers.compose import not_run, open_edited, outdated_steps, steps_to_come
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
-from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
+from usdbrdf.errors import InputRefused, NoLocks, OwnershipConflict, UsageError
 from usdbrdf.files.atomic import (
     environment_failures,
     make_folders,
@@ -68,17 +68,17 @@ def publish(
             "another place. [publish.destination]"
         )
     with reading(asset.folder, wait_s=wait_s):
-        _refuse_unsound(asset)
-        lock = destination / _LOCKED
-        with environment_failures(str(destination)), _made(destination):
-            lock.mkdir(exist_ok=True)
-            with folder_lock(lock, wait_s, without_lock=without_lock):
-                return _published(asset, destination, options)
+        _refuse_unsound(asset, options)
+        with (
+            environment_failures(str(destination)),
+            _locked(destination, wait_s, without_lock=without_lock),
+        ):
+            return _published(asset, destination, options)
 
 
-def _refuse_unsound(asset: Asset) -> None:
+def _refuse_unsound(asset: Asset, options: PublishOptions) -> None:
     """OwnershipConflict for files that somebody changed by hand; InputRefused for steps that were
-    run after those that build on them."""
+    run after those that build on them, and for those that were not run, unless asked for."""
     if edited := edited_files(asset.folder):
         raise OwnershipConflict(
             f"{asset.folder}: {', '.join(edited)} changed since usdbrdf wrote them. Run `usdbrdf "
@@ -90,21 +90,46 @@ def _refuse_unsound(asset: Asset) -> None:
             f"{asset.folder}: {'; '.join(old)}. Run `usdbrdf convert` again, which brings all "
             "steps up to date, and publish then. [publish.outdated]"
         )
+    if (missing := steps_to_come(asset)) and not options.unfinished:
+        raise InputRefused(
+            f"{asset.folder}: {not_run(missing)}, so what others take in would lack its measured "
+            "materials for good. Run `usdbrdf convert`, which goes on from there, or publish it as "
+            "it is with --unfinished. [publish.unfinished]"
+        )
 
 
 @contextmanager
-def _made(destination: Path) -> Iterator[None]:
-    """The folder, made; gone again where nothing was published into it."""
-    new = [f for f in (destination, *destination.parents) if not f.exists()]
-    make_folders(destination)
-    try:
-        yield
-    except BaseException:
-        if new and {entry.name for entry in destination.iterdir()} <= {_LOCKED}:
-            shutil.rmtree(destination / _LOCKED, ignore_errors=True)
+def _locked(destination: Path, wait_s: float, *, without_lock: bool) -> Iterator[None]:
+    """The folder, made, and nobody else publishing into it; gone again where nothing was published
+    into it, while it is still held: who waits for it makes it anew."""
+    lock, new = destination / _LOCKED, list[Path]()
+    with ExitStack() as held:
+        while True:
+            new = [f for f in (destination, *destination.parents) if f in new or not f.exists()]
+            make_folders(destination)
+            try:
+                lock.mkdir(exist_ok=True)
+                held.enter_context(folder_lock(lock, wait_s, without_lock=without_lock))
+                break
+            except FileNotFoundError:
+                continue  # another publish failed, and took the folder away
+            except NoLocks:
+                _remove_unused(destination, new)
+                raise
+        try:
+            yield
+        except BaseException:
+            _remove_unused(destination, new)
+            raise
+
+
+def _remove_unused(destination: Path, new: Iterable[Path]) -> None:
+    """Folders that were made for what was not published then, the innermost first."""
+    if new and {entry.name for entry in destination.iterdir()} <= {_LOCKED}:
+        shutil.rmtree(destination / _LOCKED, ignore_errors=True)
+        with suppress(OSError):  # others have put something there meanwhile
             for place in new:
                 place.rmdir()
-        raise
 
 
 def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict[str, Any]:
@@ -118,7 +143,7 @@ def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict
     with temporary_folder(destination / _LOCKED / _STAGED / version) as staged:
         manifest = _write(asset, staged, version, options)
         if earlier and manifest.content == _content_of(like):
-            return _summary(like, read_manifest(like), new=False)
+            return _summary(asset, like, read_manifest(like), new=False)
         if version in earlier:
             raise OwnershipConflict(
                 f"{final}: this version is there and holds something else. Versions never change: "
@@ -127,7 +152,7 @@ def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict
         for file in (each for each in staged.rglob("*") if each.is_file()):
             file.chmod(file.stat().st_mode & 0o444)
         publish_folder(staged, final)
-    return _summary(final, manifest, new=True)
+    return _summary(asset, final, manifest, new=True)
 
 
 def versions_in(destination: Path) -> list[str]:
@@ -164,12 +189,12 @@ def _content_of(version: Path) -> str:
 def _write(asset: Asset, folder: Path, version: str, options: PublishOptions) -> Manifest:
     root, space = f"{asset.name}.usd", SPACES[options.texture_space]
     identifier = _identifier(options.uri, asset.name, version) or f"./{root}"
-    components = _unpublished(asset)
+    components, missing = _unpublished(asset), steps_to_come(asset)
     said = hashlib.sha256(f"{options.encoding}\0{options.uri}\0{space}\0".encode())
 
     def describe(layer: Sdf.Layer) -> None:
         said.update(layer.ExportToString().encode())
-        _describe(layer, asset.name, version, identifier)
+        _describe(layer, asset.name, version, identifier, missing)
         for path in components:
             _tell(Sdf.CreatePrimInLayer(layer, path), version=version)
 
@@ -250,17 +275,19 @@ def _tell(prim: Sdf.PrimSpec, **info: object) -> None:
     prim.SetInfo("assetInfo", {**known, **info})
 
 
-def _describe(layer: Sdf.Layer, name: str, version: str, identifier: str) -> None:
+def _describe(
+    layer: Sdf.Layer, name: str, version: str, identifier: str, missing: list[str]
+) -> None:
     """What the root layer of a version says of it."""
     layer.documentation = (
         "A published version, which never changes. Reference it, or put opinions into a layer of "
         "your own above it."
-    )
+    ) + (f" It is unfinished: {not_run(missing)}." if missing else "")
     root = Sdf.CreatePrimInLayer(layer, f"/{layer.defaultPrim}")
     _tell(root, identifier=Sdf.AssetPath(identifier), name=name, version=version)
 
 
-def _summary(version: Path, manifest: Manifest, *, new: bool) -> dict[str, Any]:
+def _summary(asset: Asset, version: Path, manifest: Manifest, *, new: bool) -> dict[str, Any]:
     size = sum((version / path).stat().st_size for path in manifest.files)
     return {
         "publish": str(version),
@@ -269,5 +296,6 @@ def _summary(version: Path, manifest: Manifest, *, new: bool) -> dict[str, Any]:
         "texture_space": manifest.texture_space,
         "files": len(manifest.files),
         "bytes": size,
+        "unfinished": steps_to_come(asset),
         "new": new,
     }

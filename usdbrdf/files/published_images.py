@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
-from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.atomic import publish, temporary_beside
 from usdbrdf.files.colour import chromaticities_of
 from usdbrdf.files.images import (
@@ -40,8 +40,16 @@ _ABOUT_PIXELS = re.compile(
     r"|(X|Y)Resolution|ResolutionUnit"
 )
 _HDR_LINES = re.compile(rb"FORMAT=|EXPOSURE=|COLORCORR=|PRIMARIES=|PIXASPECT=")
-_JPEG, _HDR = frozenset({".jpg", ".jpeg"}), frozenset({".hdr", ".pic"})
-CLEANED = _JPEG | _HDR | {".exr", ".tif", ".tiff", ".png"}
+# What programs expect behind which name, as OpenImageIO calls it.
+_NAMED = {
+    "jpeg": frozenset({".jpg", ".jpeg"}),
+    "hdr": frozenset({".hdr", ".pic"}),
+    "openexr": frozenset({".exr"}),
+    "tiff": frozenset({".tif", ".tiff"}),
+    "png": frozenset({".png"}),
+}
+_SUFFIX = {format: min(suffixes) for format, suffixes in _NAMED.items()}
+CLEANED = frozenset[str]().union(*_NAMED.values())
 
 
 def write_texture(
@@ -80,20 +88,45 @@ def write_texture(
         publish(staged, target)
 
 
+def misnamed(path: Path) -> str:
+    """What is wrong with the name of a picture, in words: its bytes are of another format than
+    that by which programs choose how to read it; "" where nothing is."""
+    format, suffix = open_image(path).format_name(), path.suffix.lower()
+    if suffix not in CLEANED or suffix in _NAMED[format]:
+        return ""
+    return (
+        f"it holds {format.removeprefix('open').upper()} and is called {suffix}, by which programs "
+        "choose how to read it. Rename it, or export it again."
+    )
+
+
+def refuse_misnamed(path: Path) -> None:
+    """InputRefused for a picture that is not what its name says."""
+    if wrong := misnamed(path):
+        raise InputRefused(f"{path}: {wrong} [image.name]")
+
+
 def copy_without_metadata(source: Path, target: Path) -> None:
     """A picture without EXIF, GPS, XMP, comments and names of people and devices; a file that has
     none of these is copied as it is. Formats other than EXR, HDR, TIFF, PNG and JPEG are copied
     too."""
-    kind = source.suffix.lower()
-    with temporary_beside(target) as staged:
-        if kind in _JPEG:
-            pixels = pixels_of(source, open_image(source))  # refuses what is cut short
+    if source.suffix.lower() not in CLEANED:
+        with temporary_beside(target) as staged:
+            shutil.copyfile(source, staged)
+            publish(staged, target)
+        return
+    reader = open_image(source)
+    kind = reader.format_name()  # photographs may be called otherwise, and stay so
+    # What is written anew is written as the name of its file says.
+    named = target if target.suffix.lower() in _NAMED[kind] else target.with_suffix(_SUFFIX[kind])
+    with temporary_beside(named) as staged:
+        if kind == "jpeg":
+            pixels = pixels_of(source, reader)  # refuses what is cut short
             staged.write_bytes(jpeg_without_metadata(source.read_bytes()))
             refuse_other(target, staged, pixels)
-        elif kind in _HDR:
+        elif kind == "hdr":
             staged.write_bytes(_hdr_without_metadata(source.read_bytes()))
-        elif kind in CLEANED and _tells_more(open_image(source).spec()):
-            reader = open_image(source)
+        elif _tells_more(reader.spec()):
             spec = _plain_spec(reader.spec(), "")
             pixels = pixels_of(source, reader)
             write_image(target, staged, spec, pixels)

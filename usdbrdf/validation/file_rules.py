@@ -20,6 +20,7 @@ from usdbrdf.asset.readers.tried import try_layers
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import read_exr
+from usdbrdf.files.published_images import misnamed
 from usdbrdf.job.ownership import edited_files
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, located, record_of, rule
@@ -135,9 +136,12 @@ def anchored_path(scene: AssetStage) -> Iterator[Fault]:
     file.
 
     Bring the file into the asset's folder and name it relative to the layer."""
+    known = scene.root_prim.GetAssetInfoByKey("identifier") if scene.root_prim else None
     for layer, path, value in scene.asset_paths if scene.asset else ():
         site, said = _site(scene.stage, layer, path), f"@{value}@ in @{layer.realPath}@"
         if _URI.match(value):
+            if isinstance(known, Sdf.AssetPath) and value == known.path:
+                continue  # by which others find the asset, and nothing of it
             problem = f"{said} is for a resolver that others may not have."
             yield Fault(site, problem, severity=Severity.WARNING)
         elif not value.startswith(("./", "../")):
@@ -183,10 +187,12 @@ def missing_texture(scene: AssetStage) -> Iterator[Fault]:
 
 @rule(Severity.ERROR)
 def unreadable_texture(scene: AssetStage) -> Iterator[Fault]:
-    """Every picture that a layer names can be read to its last pixel. Of one that was cut off, by a
-    copy that was interrupted, renderers show a part, black, or nothing.
+    """Every picture that a layer names can be read to its last pixel, and is of the format that its
+    name says. Of one that was cut off, by a copy that was interrupted, renderers show a part,
+    black, or nothing; a JPEG that is called .exr some of them do not open.
 
-    Bring the file back from a copy; or delete it and run usdbrdf convert, which makes it anew."""
+    Bring the file back from a copy, or rename it; or delete it and run usdbrdf convert, which makes
+    it anew."""
     if not scene.asset:
         return
     named: dict[Path, tuple[Sdf.Layer, Sdf.Path]] = {}
@@ -195,11 +201,16 @@ def unreadable_texture(scene: AssetStage) -> Iterator[Fault]:
         if file.suffix.lower() in _PICTURES and not _URI.match(value) and file.is_file():
             named.setdefault(file, (layer, path))
     for file, (layer, path) in sorted(named.items()):
+        severity = None
         try:
             read_exr(file)
+            if not (said := misnamed(file)):
+                continue
+            if scene.asset.is_published:  # then it came with the capture, and may not change
+                severity = Severity.WARNING
         except UsdBrdfError as problem:
             said = str(problem).rpartition(" [")[0].removeprefix(f"{file}: ")
-            yield Fault(_site(scene.stage, layer, path), f"@{file}@: {said}")
+        yield Fault(_site(scene.stage, layer, path), f"@{file}@: {said}", severity)
 
 
 @rule(Severity.WARNING)

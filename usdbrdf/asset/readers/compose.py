@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
@@ -10,7 +11,7 @@ from typing import Any
 
 from pxr import Sdf, Tf, Usd, UsdUtils
 
-from usdbrdf.asset.header import Provenance, new_layer, read_header
+from usdbrdf.asset.header import Provenance, new_layer, read_header, read_provenance
 from usdbrdf.asset.layout import LIGHTING, ROLES, Asset
 from usdbrdf.asset.manifest import refuse_converted
 from usdbrdf.asset.maps import AssetMaps
@@ -31,6 +32,8 @@ from usdbrdf.options import NO_LIGHT, Surroundings
 from usdbrdf.untrusted.usd_paths import words_of
 
 _MAX_LENGTH = 600
+# An asset path with a scheme, as USD's messages spell it.
+_ADDRESS = re.compile(r"@[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 def in_one_line(error: object) -> str:
@@ -166,9 +169,14 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
             "earlier copy of it. [stage.open]"
         ) from error
     if problems:
+        cure = "Correct that layer, or bring back the file that it names."
+        if _ADDRESS.search(problems[0]):
+            cure = (
+                "That is an address: run usdbrdf where the resolver that knows it is set up "
+                "(PXR_PLUGINPATH_NAME), or name a file."
+            )
         raise InputRefused(
-            f"{subject}: the stage does not compose: {problems[0]}. Correct that layer, or bring "
-            "back the file that it names. [stage.open]"
+            f"{subject}: the stage does not compose: {problems[0]}. {cure} [stage.open]"
         )
     return stage
 
@@ -249,6 +257,24 @@ def outdated_steps(asset: Asset) -> list[str]:
             if layer.parent == folder and layer.is_file() and sha256_of(layer) != sha256:
                 found.append(f"{stamp.stage} was made with another {name}")  # type: ignore[union-attr]
     return found
+
+
+def steps_to_come(asset: Asset) -> list[str]:
+    """Which steps have not been run, in any or one of the lightings, in their order."""
+    found = []
+    for step, role in zip(("texture", "shade", "fit"), ROLES[1:], strict=True):
+        layers = {one.layer(role) for one in (asset, *asset.in_each_lighting)}
+        records = [read_provenance(layer) for layer in layers if layer.is_file()]
+        if any(record.get("state") == "pending" for record in records):
+            found.append(step)
+    return found
+
+
+def not_run(steps: Sequence[str]) -> str:
+    """What is to be said of them, in words."""
+    if len(steps) == 1:
+        return f"the step {steps[0]} was not run"
+    return f"the steps {', '.join(steps[:-1])} and {steps[-1]} were not run"
 
 
 def _beneath(asset: Asset) -> list[Path]:
