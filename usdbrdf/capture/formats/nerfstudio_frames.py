@@ -222,13 +222,15 @@ def _capture_from_colmap(
     try:
         model = colmap_model(models[0])
     except UsdBrdfError as error:
-        return unknown(f"its model was not read ({error})")
+        unknown(f"its model was not read ({error})")
+        return None
     theirs = _by_ends(model.names)
     pairs = [(i, _longest_end(path, theirs)) for i, path in enumerate(frames.image_paths)]
     known = [(i, k) for i, k in pairs if k is not None]
     others = f"its model {models[0].relative_to(folder).as_posix()} has not the same cameras"
     if len(known) < max(3, len(frames) / 2) or len({k for _, k in known}) < len(known):
-        return unknown(others)
+        unknown(others)
+        return None
     ours, their = (list(numbers) for numbers in zip(*known, strict=True))
     ends = frames.world_from_camera[ours]
     starts = np.stack([world_from_camera(model.camera_from_world[k]) for k in their])
@@ -240,17 +242,19 @@ def _capture_from_colmap(
     spread = float(np.linalg.norm(to_places - centre))
     from_spread = float(np.linalg.norm(from_places - from_centre))
     if min(spread, from_spread) < 1 / _LARGEST:
-        return unknown("its cameras are all in one place")
+        unknown("its cameras are all in one place")
+        return None
     scale = spread / from_spread
     off = np.linalg.norm(scale * (from_places - from_centre) + centre - to_places, axis=1)
     if max(np.abs(turns - turn).max(), off.max() / spread) > _SAME_CAMERA:
-        return unknown(others)
+        unknown(others)
+        return None
     moved = rigid_pose(scale * turn, centre - scale * from_centre)
     return None if np.abs(moved - np.eye(4)).max() < _SAME_FRAME else (models[0], moved)
 
 
 def _by_ends(names: Sequence[str]) -> dict[tuple[str, ...], int | None]:
-    """The numbers of names by each end of their paths, without suffix; None where several have it."""
+    """The numbers of names by each end of their paths, without suffix; None for several."""
     found: dict[tuple[str, ...], int | None] = {}
     for k, name in enumerate(names):
         parts = PurePosixPath(name.replace("\\", "/")).with_suffix("").parts
