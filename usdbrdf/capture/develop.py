@@ -197,12 +197,20 @@ def _recorded(
 
 
 def with_rims(
-    records: Sequence[FrameRecord], folders: Sequence[Path], findings: Findings, source: Path
+    records: Sequence[FrameRecord],
+    places: tuple[Path, Path | None],
+    findings: Findings,
+    source: Path,
 ) -> list[FrameRecord]:
     """Records of which those that lie in a folder of undistorted pictures, and whose cameras bend
     nothing, have a rim if some of them are black in a corner.
 
-    folders  below the first of these that a picture lies in, names of folders say what it is"""
+    places  the capture's folder, and the user's of the pictures: the names of folders below that
+            say what these are; of the user's elsewhere its own and the next, as what a whole
+            project is called says nothing
+    """
+    folder, frames = places
+    folders = [folder, *([*frames.resolve().parents[:2]][-1:] if frames is not None else [])]
     if any(record.rim for record in records):
         return list(records)
     undistorted = [

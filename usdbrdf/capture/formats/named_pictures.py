@@ -420,9 +420,7 @@ def scan_of(
                 f"{record.name!r} in {source.name} bends light. Bring the original pictures, or "
                 "the cameras that were exported for these. [capture.camera]"
             )
-    # Of --frames elsewhere its own name and the next; what a whole project is called says nothing.
-    elsewhere = [] if options.frames is None else [*options.frames.resolve().parents[:2]][-1:]
-    records = with_rims(records, [folder, *elsewhere], findings, source)
+    records = with_rims(records, (folder, options.frames), findings, source)
     if masks := sum(record.mask_path is not None for record in records):
         findings.warn(
             f"{source.name}: {masks} masks are used; what is black there is not looked at. "
