@@ -158,10 +158,10 @@ def test_a_usd_mesh_in_the_frame_of_the_training_is_refused(capture):
     np.testing.assert_allclose(np.ptp(scan.mesh.points, axis=0), np.ptp(capture.points, axis=0))
 
 
-def _recentred(made, folder, *, similarity):
+def _recentred(made, folder, *, similarity, names=None):
     """COLMAP's model of a capture in ``folder``, and its document as colmap2nerf.py leaves it:
     the world turned, moved and scaled, and no word of that."""
-    names = [f"{i:04d}.exr" for i in range(len(made.world_from_camera))]
+    names = names or [f"{i:04d}.exr" for i in range(len(made.world_from_camera))]
     camera = pycolmap.Camera(model="PINHOLE", width=32, height=24, params=[24.0, 24, 16, 12])
     model = reconstruction(made, [camera], names)
     write_model(made.folder / folder, model, text="text" in folder)
@@ -191,6 +191,54 @@ def test_colmaps_mesh_is_brought_to_poses_that_instant_ngp_moved(capture):
     assert any(f"the frame of its model {folder}; it is brought" in said for said in scan.warnings)
     scan = read_scan(capture.folder, IngestOptions(), "colmap")
     np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-5)
+
+
+def test_cameras_of_one_name_in_several_folders_are_told_apart(capture):
+    """As rigs have them."""
+    similarity = np.eye(4)
+    similarity[:3, 3] = 0.3, -0.2, 0.5
+    names = [f"cam{i % 2}/{i // 2:04d}.exr" for i in range(len(capture.world_from_camera))]
+    _recentred(capture, "colmap_text", similarity=similarity, names=names)
+    with edited(capture.manifest) as document:
+        for frame, name in zip(document["frames"], names, strict=True):
+            place = capture.folder / "frames" / name
+            place.parent.mkdir(exist_ok=True)
+            (capture.folder / frame["file_path"]).rename(place)
+            frame["file_path"] = f"frames/{name}"
+    (capture.folder / "mesh.ply").rename(capture.folder / "meshed-poisson.ply")
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, capture.points + similarity[:3, 3], atol=1e-5)
+
+
+@pytest.mark.parametrize("others", ["names", "poses"])
+def test_colmaps_mesh_beside_a_model_of_other_cameras_is_told(capture, others):
+    count = len(capture.world_from_camera)
+    similarity = np.eye(4)
+    similarity[:3, 3] = 0.3, -0.2, 0.5
+    names = [f"other_{i}.exr" for i in range(count)] if others == "names" else None
+    _recentred(capture, "colmap_text", similarity=similarity, names=names)
+    with edited(capture.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            pose = np.array(frame["transform_matrix"])
+            if others == "poses":
+                pose[:3, 3] += 0.4 * np.sin([i, 2 * i, 3 * i])
+            frame["transform_matrix"] = pose.tolist()
+    (capture.folder / "mesh.ply").rename(capture.folder / "meshed-poisson.ply")
+    scan = read_scan(capture.folder, IngestOptions())
+    assert scan.mesh.points.tobytes() == capture.points.tobytes()
+    assert any("frame than the poses is not known, as its" in said for said in scan.warnings)
+
+
+def test_of_cameras_in_one_place_it_is_that_which_is_said(capture):
+    _recentred(capture, "colmap_text", similarity=np.eye(4))
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, 3] = 1, 1, 1
+            frame["transform_matrix"] = pose.tolist()
+    (capture.folder / "mesh.ply").rename(capture.folder / "meshed-poisson.ply")
+    with pytest.raises(InputRefused, match=r"there is no parallax.*\[capture\.parallax\]$"):
+        read_scan(capture.folder, IngestOptions())
 
 
 def test_colmaps_mesh_stays_where_the_poses_are_its_models(capture):

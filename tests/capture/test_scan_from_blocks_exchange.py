@@ -20,6 +20,7 @@ from tests.format_truth import (
 from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
 from usdbrdf.capture.reconstructions.blocks_exchange import shots_of
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.images import write_exr
 from usdbrdf.files.tables import read_xml
 from usdbrdf.options import IngestOptions
 
@@ -276,6 +277,35 @@ def test_masks_that_the_block_names_are_used(tmp_path, stated, lies):
     assert not any("[capture.unused]" in said for said in scan.warnings)
 
 
+@pytest.mark.parametrize("place", ["images", "elsewhere"])
+def test_masks_do_not_lead_out_of_the_capture(tmp_path, place):
+    room, capture = truth().square(), tmp_path / "capture"
+    first = "0000.jpg</ImagePath>"
+    named = _document(room).replace(first, f"{first}<MaskPath>sky.png</MaskPath>")
+    _write(capture, room, named)
+    write_image(tmp_path / "outside.png", room.images[0])
+    (capture / "images/sky.png").symlink_to(tmp_path / "outside.png")
+    frames = (capture / "images").rename(tmp_path / place) if place == "elsewhere" else None
+    with pytest.raises(InputRefused, match=r"leads outside that folder.*\[paths\.outside\]$"):
+        read_scan(capture, dataclasses.replace(OPTIONS, frames=frames))
+
+
+def test_a_photograph_is_not_the_mask_of_its_radiance(tmp_path):
+    """Masks in a folder that was not copied are called as the photographs are."""
+    room = truth().square()
+    document = _document(room)
+    for i in range(len(room.images)):
+        said = f"{i:04d}.jpg</ImagePath>"
+        document = document.replace(said, f"{said}<MaskPath>D:/Masks/{i:04d}.jpg</MaskPath>")
+    _write(tmp_path, room, document)
+    for i, image in enumerate(room.images):
+        write_exr(tmp_path / f"images/{i:04d}.exr", np.float32(image))
+    scan = read_scan(tmp_path, IngestOptions())
+    assert {path.suffix for path in scan.frames.image_paths} == {".exr"}
+    assert scan.views == ()
+    assert any("10 of the masks that it names are not there" in said for said in scan.warnings)
+
+
 def test_spheres(tmp_path):
     document = _document(truth()).replace(">Perspective<", ">Spherical<")
     camera = _shots(tmp_path, document)[0].camera
@@ -303,6 +333,12 @@ def test_photographs_that_were_not_placed_are_left_out(tmp_path):
             ">Fisheye</CameraModelType><FisheyeDistortion><P0>0.1</P0></FisheyeDistortion>",
             "P0 of FisheyeDistortion is 0.1, which leaves a hole",
         ),
+        (
+            ">Perspective</CameraModelType><CameraModelBand>Visible</CameraModelBand>"
+            "<FocalLengthPixels>",
+            ">Fisheye</CameraModelType><FocalLengthPixels>-",
+            "only 0 of 10 frames can be used",
+        ),
         ("M_00>", "Yaw>", "its rotations are headings, pitches and rolls"),
         ("<SRSId>2<", "<SRSId>0<", r"its coordinates are longitudes .*\(EPSG:4326"),
         (f">{ENU}<", ">WGS84<", "its coordinates are longitudes and latitudes"),
@@ -325,9 +361,7 @@ def test_what_is_not_read_is_refused(tmp_path, old, new, said):
         read_scan(tmp_path, OPTIONS)
 
 
-def test_a_model_in_tiles_is_one(tmp_path):
-    """Each is a piece of it, and its materials are those of the piece."""
-    room = truth().square()
+def _write_in_tiles(tmp_path, room):
     _write(tmp_path, room, _document(room), "Data/Tile_0/Tile_0.obj")
     (tmp_path / "Data/Tile_0/Tile_0.obj").unlink()
     left = room.points[room.triangles][:, :, 0].mean(axis=1) < room.points[:, 0].mean()
@@ -341,6 +375,13 @@ def test_a_model_in_tiles_is_one(tmp_path):
         )
         (tmp_path / f"Data/Tile_{i}").mkdir(exist_ok=True)
         write_obj(tmp_path / f"Data/Tile_{i}/Tile_{i}.obj", piece)
+
+
+def test_a_model_in_tiles_is_one(tmp_path):
+    """Each is a piece of it, and its materials are those of the piece."""
+    room = truth().square()
+    _write_in_tiles(tmp_path, room)
+    (tmp_path / "model.mtl").write_text("newmtl wall\n")
     scan = read_scan(tmp_path, OPTIONS)
     assert_same(scan, room)
     assert any("2 tiles, first Data/Tile_0/Tile_0.obj. [mesh.tiles]" in w for w in scan.warnings)
@@ -352,6 +393,27 @@ def test_a_model_in_tiles_is_one(tmp_path):
     assert_same(
         read_scan(tmp_path, dataclasses.replace(OPTIONS, mesh=tmp_path / "whole.obj")), room
     )
+
+
+@pytest.mark.parametrize("name", ["mesh.obj", "house.obj"])
+def test_a_mesh_beside_tiles_is_taken_instead(tmp_path, name):
+    """Also where these have levels of detail."""
+    room = truth().square()
+    _write_in_tiles(tmp_path, room)
+    write_obj(tmp_path / "Data/Tile_1/Tile_1_L19.obj", room)
+    write_obj(tmp_path / name, room)
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, room)
+    assert not any("[mesh.tiles]" in said for said in scan.warnings)
+
+
+def test_tiles_do_not_lead_out_of_the_capture(tmp_path):
+    room, capture = truth().square(), tmp_path / "capture"
+    _write_in_tiles(capture, room)
+    (capture / "Data/Tile_1").rename(tmp_path / "elsewhere")
+    (capture / "Data/Tile_1").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputRefused, match=r"leads outside that folder.*\[paths\.outside\]$"):
+        read_scan(capture, OPTIONS)
 
 
 def test_a_model_of_another_system_is_refused(tmp_path):

@@ -86,18 +86,29 @@ def test_pictures_that_were_not_placed_are_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("folder", "width"), [("undistorted_images", 4), ("undistorted_images", 0), ("images", 4)]
+    ("folder", "width"),
+    [
+        ("undistorted_images", 4),
+        ("undistorted_images", 0),
+        ("images", 4),
+        ("../undistorted/images", 4),
+        ("../undistorted trials/room/images", 4),
+    ],
 )
 def test_the_black_rim_of_undistorted_pictures_is_left_out(tmp_path, folder, width):
     """As openMVG_main_ExportUndistortedImages leaves it; of others nobody knows what is black."""
     room = truth().square()
+    base = tmp_path / "capture"
     images = [np.maximum(image, 0.02) for image in room.images]
     for image in images[::4]:
         image[:, :width] = image[:width] = 0
-    _write(tmp_path, dataclasses.replace(room, images=images), _document(room))
-    (tmp_path / "images").rename(tmp_path / folder)
-    scan = read_scan(tmp_path, dataclasses.replace(OPTIONS, frames=tmp_path / folder))
-    found = folder != "images" and width > 0
+    _write(base, dataclasses.replace(room, images=images), _document(room))
+    frames = (base / folder).resolve()
+    frames.parent.mkdir(parents=True, exist_ok=True)
+    (base / "images").rename(frames)
+    scan = read_scan(base, dataclasses.replace(OPTIONS, frames=frames))
+    called = folder in ("undistorted_images", "../undistorted/images")
+    found = called and width > 0
     assert any("black along their borders" in said for said in scan.warnings) == found
     assert any(view is not None and view.rim for view in scan.views) == found
 

@@ -190,7 +190,9 @@ def write_sidecars(folder, room, *, as_attributes):
     return folder
 
 
-@pytest.mark.parametrize("bent", ["", "0 0 0 0 0 0", "-0.1 0 0 0 0 0"])
+@pytest.mark.parametrize(
+    "bent", ["", "0", "0 0 0 0 0 0", "-0.1 0 0 0 0 0", "-0.1", "-0,1 0 0 0 0 0"]
+)
 def test_a_division_without_terms_is_a_pinhole(tmp_path, room, bent):
     """As those write it who cut panoramas into pictures."""
     folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)

@@ -422,3 +422,24 @@ def test_where_pixels_mix_all_stripes_of_shadow_their_means_tell_the_sun(monkeyp
     monkeypatch.setattr(outside, "_as_pixels_mix", lambda *_: None)
     found, _ = _under_stripes(0.21)
     assert (found.environment.sun.irradiance < 0.6 * SUN.irradiance).all()
+
+
+def test_means_keep_to_the_wall_where_another_lies_beside_it_in_the_atlas():
+    """Own UVs may have two charts so near that means reach over the gap."""
+    one, other = quad((0, 0, 0), (2, 0, 0), (0, 2, 0)), quad((9, 0, 3), (2, 0, 0), (0, 2, 0))
+    both = replace(
+        one,
+        points=np.concatenate([one.points, other.points]),
+        triangles=np.concatenate([one.triangles, other.triangles + len(one.points)]),
+        uv=np.concatenate([one.uv * (18 / 40, 1), (22 / 40, 0) + other.uv * (18 / 40, 1)]),
+        normals=np.concatenate([one.normals, other.normals]),
+        size=(40, 20),
+    )
+    texels = world_of([both]).texels
+    every = np.arange(len(texels))
+    left = texels.position[:, 0] < 5
+    for right in (-4, -2, 2, 4):
+        beside, there = outside.on_the_same_wall(texels, every, right, 0)
+        np.testing.assert_array_equal(left[beside[there]], left[there])
+        # All but the columns at the end of each.
+        assert there.sum() == 2 * 20 * (19 - abs(right))

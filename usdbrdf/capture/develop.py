@@ -197,16 +197,26 @@ def _recorded(
 
 
 def with_rims(
-    records: Sequence[FrameRecord], folder: Path, findings: Findings, source: Path
+    records: Sequence[FrameRecord],
+    places: tuple[Path, Path | None],
+    findings: Findings,
+    source: Path,
 ) -> list[FrameRecord]:
     """Records of which those that lie in a folder of undistorted pictures, and whose cameras bend
-    nothing, have a rim if some of them are black in a corner."""
+    nothing, have a rim if some of them are black in a corner.
+
+    places  the capture's folder, and the user's of the pictures: the names of folders below that
+            say what these are; of the user's elsewhere its own and the next, as what a whole
+            project is called says nothing
+    """
+    folder, frames = places
+    folders = [folder, *([*frames.resolve().parents[:2]][-1:] if frames is not None else [])]
     if any(record.rim for record in records):
         return list(records)
     undistorted = [
         record.image_path
         for record in records
-        if not record.lens.bends and _is_called_undistorted(record.image_path, folder)
+        if not record.lens.bends and _is_called_undistorted(record.image_path, folders)
     ]
     some = spread_evenly(len(undistorted), _PROBED_PICTURES)
     if not any(_is_black_in_a_corner(undistorted[i]) for i in some):
@@ -219,9 +229,10 @@ def with_rims(
     return [replace(record, rim=record.image_path in concerned) for record in records]
 
 
-def _is_called_undistorted(picture: Path, folder: Path) -> bool:
-    inside = picture.relative_to(folder) if picture.is_relative_to(folder) else picture
-    return any("undistort" in part.lower() for part in inside.parent.parts)
+def _is_called_undistorted(picture: Path, folders: Sequence[Path]) -> bool:
+    home = next((folder for folder in folders if picture.is_relative_to(folder)), None)
+    names = picture.relative_to(home).parent.parts if home else (picture.parent.name,)
+    return any("undistort" in name.lower() for name in names)
 
 
 def _is_black_in_a_corner(picture: Path) -> bool:

@@ -53,8 +53,13 @@ _PROFILES = {
     "display p3": "srgb_p3d65_scene",
     "sp3c": "srgb_p3d65_scene",
 }
-# Those of Android, GIMP, Ghostscript and others; not of linear values with the same primaries.
-_CALLED_SRGB = re.compile(r"^(?!.*(linear|\bg10\b)).*\bsrgb")
+# Those of Android, GIMP, Ghostscript and others; not of linear values with the same primaries, nor
+# of other primaries whose values have sRGB's curve.
+_CALLED_SRGB = re.compile(
+    r"(?!.*(linear|(?<![a-z])lin(?![a-z])|\bg10\b|gamma 1\.0))"
+    r"(?!.*(p3|2020|adobe|prophoto|wide|\bap[01]\b|aces))"
+    r".*\bsrgb(?![ _-]*(trc|curve|gamma|tone|transfer))"
+)
 _UNKNOWN_SHOWN_AS = (255, 0, 255)
 # Pictures are exposed so that this percentile comes out as this linear value.
 _SHOWN_PERCENTILE, _SHOWN_AS = 90, 0.8
@@ -82,10 +87,12 @@ def encoding_of_tag(name: str, chromaticities: tuple[float, ...]) -> str | None:
     """The colour space that an image says it has, see ``files.images.colour_tag``; None where it
     says nothing that is known."""
     profile = name.lower().strip()
-    if profile in _PROFILES or _CALLED_SRGB.search(profile):
-        return _PROFILES.get(profile, DISPLAY_SPACE)
+    if profile in _PROFILES:
+        return _PROFILES[profile]
     if name and kind_of_encoding(name):
         return name
+    if _CALLED_SRGB.match(profile):
+        return DISPLAY_SPACE
     for encoding, places in _CHROMATICITIES.items():
         if chromaticities and np.abs(np.subtract(places, chromaticities)).max() < _SAME_PLACE:
             return encoding

@@ -20,9 +20,9 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Double, Float, Int, Long
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.texels import CoverageMap
+from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import (
     LEAST_OF_SEGMENT,
     PER_SEGMENT,
@@ -429,10 +429,9 @@ def _as_pixels_mix(look: _Look, told: _Told) -> tuple[_Told, Double] | None:
     surface, asked = look.surface, told.asked
     texels, centre, whole = surface.texels, asked.texel, ~asked.clipped
     reflected, share = np.zeros_like(asked.reflected), np.zeros(len(centre))
-    sunny, width = np.zeros(len(centre), np.bool_), texels.resolution[asked.owner, 0]
+    sunny = np.zeros(len(centre), np.bool_)
     for right, down in product(_MIXED, repeat=2):
-        beside = texels.beside(centre, right, down).astype(np.int64)
-        there = texels.pixel[beside] - texels.pixel[centre] == right + down * width
+        beside, there = on_the_same_wall(texels, centre, right, down)
         own = sunlit(surface, beside, told.sun, look.seed)
         whole &= there & look.coverage.measured[beside]
         sunny |= there & (own > 0)
@@ -447,6 +446,17 @@ def _as_pixels_mix(look: _Look, told: _Told) -> tuple[_Told, Double] | None:
     with_sun = mixed.of(kept), sources._replace(share=sources.share[:, kept])
     found = solved(*with_sun)
     return told._replace(with_sun=with_sun, found=found), jackknife(*with_sun, found)
+
+
+def on_the_same_wall(texels: Texels, index: Long, right: int, down: int) -> tuple[Long, Bool]:
+    """The texels beside those ``index``, (N,), as ``Texels.beside``; and which of them lie as far
+    away on the surface, (N,): others are of another part of it that has its place there."""
+    beside = texels.beside(index, right, down).astype(np.int64)
+    width = texels.resolution[texels.object_index()[index], 0]
+    there = texels.pixel[beside] - texels.pixel[index] == right + down * width
+    expected = texels.position[index] + right * texels.step_x[index] + down * texels.step_y[index]
+    off = np.linalg.norm(texels.position[beside] - expected, axis=1)
+    return beside, there & (off < np.sqrt(texels.area[index]))
 
 
 def _of_measured(seen: Surroundings, z_up: bool) -> Environment:

@@ -420,7 +420,7 @@ def scan_of(
                 f"{record.name!r} in {source.name} bends light. Bring the original pictures, or "
                 "the cameras that were exported for these. [capture.camera]"
             )
-    records = with_rims(records, folder, findings, source)
+    records = with_rims(records, (folder, options.frames), findings, source)
     if masks := sum(record.mask_path is not None for record in records):
         findings.warn(
             f"{source.name}: {masks} masks are used; what is black there is not looked at. "

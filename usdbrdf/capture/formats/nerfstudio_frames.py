@@ -12,7 +12,7 @@ order (nerf_loader.h, marching_cubes.cu).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -207,22 +207,29 @@ def _capture_from_colmap(
     mesh: Path, folder: Path, findings: Findings
 ) -> tuple[Path, Double] | None:
     """The model of COLMAP beside a document, and the similarity (4, 4) from its frame to the
-    capture's; None where there is none, it has not the same cameras, or the frame is the same."""
+    capture's; None where there is none, the frame is the same, or, which is told, nobody knows as
+    it has not the same cameras."""
     models, frames = _models_beside(folder), findings.frames
     if not models or frames is None:
         return None
+
+    def unknown(why: str) -> None:
+        findings.warn(
+            f"{mesh.name}: is called as COLMAP's meshes, but whether it lies in another frame than "
+            f"the poses is not known, as {why}. [mesh.frame]"
+        )
+
     try:
         model = colmap_model(models[0])
     except UsdBrdfError as error:
-        findings.warn(
-            f"{mesh.name}: is called as COLMAP's meshes, but whether it lies in another frame than "
-            f"the poses is not known, as its model was not read ({error}). [mesh.frame]"
-        )
+        unknown(f"its model was not read ({error})")
         return None
-    theirs = {PurePosixPath(name).stem: k for k, name in enumerate(model.names)}
-    pairs = [(i, theirs.get(path.stem)) for i, path in enumerate(frames.image_paths)]
+    theirs = _by_ends(model.names)
+    pairs = [(i, _longest_end(path, theirs)) for i, path in enumerate(frames.image_paths)]
     known = [(i, k) for i, k in pairs if k is not None]
+    others = f"its model {models[0].relative_to(folder).as_posix()} has not the same cameras"
     if len(known) < max(3, len(frames) / 2) or len({k for _, k in known}) < len(known):
+        unknown(others)
         return None
     ours, their = (list(numbers) for numbers in zip(*known, strict=True))
     ends = frames.world_from_camera[ours]
@@ -233,12 +240,32 @@ def _capture_from_colmap(
     from_places, to_places = starts[:, :3, 3] @ turn.T, ends[:, :3, 3]
     from_centre, centre = from_places.mean(axis=0), to_places.mean(axis=0)
     spread = float(np.linalg.norm(to_places - centre))
-    scale = spread / max(float(np.linalg.norm(from_places - from_centre)), 1 / _LARGEST)
+    from_spread = float(np.linalg.norm(from_places - from_centre))
+    if min(spread, from_spread) < 1 / _LARGEST:
+        unknown("its cameras are all in one place")
+        return None
+    scale = spread / from_spread
     off = np.linalg.norm(scale * (from_places - from_centre) + centre - to_places, axis=1)
-    if max(np.abs(turns - turn).max(), off.max() / max(spread, 1 / _LARGEST)) > _SAME_CAMERA:
+    if max(np.abs(turns - turn).max(), off.max() / spread) > _SAME_CAMERA:
+        unknown(others)
         return None
     moved = rigid_pose(scale * turn, centre - scale * from_centre)
     return None if np.abs(moved - np.eye(4)).max() < _SAME_FRAME else (models[0], moved)
+
+
+def _by_ends(names: Sequence[str]) -> dict[tuple[str, ...], int | None]:
+    """The numbers of names by each end of their paths, without suffix; None for several."""
+    found: dict[tuple[str, ...], int | None] = {}
+    for k, name in enumerate(names):
+        parts = PurePosixPath(name.replace("\\", "/")).with_suffix("").parts
+        for end in (parts[i:] for i in range(len(parts))):
+            found[end] = None if end in found else k
+    return found
+
+
+def _longest_end(path: Path, numbers: Mapping[tuple[str, ...], int | None]) -> int | None:
+    parts = path.with_suffix("").parts
+    return next((numbers[parts[i:]] for i in range(len(parts)) if parts[i:] in numbers), None)
 
 
 def _models_beside(folder: Path) -> list[Path]:

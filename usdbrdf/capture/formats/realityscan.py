@@ -165,7 +165,7 @@ def records_of_sidecars(
         model, terms = said.get("DistortionModel", "perspective"), _terms(said)
         if not (model == "perspective" or model.startswith("brown")) and (
             # Of the usual model without terms it is a pinhole.
-            model != "division" or any(terms)
+            model != "division" or not _is_without_terms(said)
         ):
             raise InputRefused(
                 f"{file}: the lens model {model!r} is not read. Choose Brown in the alignment's "
@@ -209,6 +209,14 @@ def _sidecar_values(root: Element) -> dict[str, str]:
         values |= {k.removeprefix(_NAMESPACE): v for k, v in described.attrib.items()}
         values |= {c.tag.removeprefix(_NAMESPACE): c.text or "" for c in described}
     return values
+
+
+def _is_without_terms(said: Mapping[str, str]) -> bool:
+    """Whether none is stated, however many of 0 are; False where nobody knows."""
+    try:
+        return not np.array(said.get("DistortionCoeficients", "").split(), np.float64).any()
+    except ValueError:
+        return False
 
 
 def _terms(said: Mapping[str, str]) -> list[float]:

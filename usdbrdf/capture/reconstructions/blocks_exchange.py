@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -92,7 +93,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         source=source,
         folder=source.parent,
         meshes=("mesh.*", "model.*", *(["Data/*/*.obj"] if len(tiles) == 1 else [])),
-        tiles=() if options.mesh else _refined_once(tiles, source),
+        tiles=partial(_refined_once, tiles, source),
         how="Put the model that was made in this block's coordinate system into this folder, with "
         f"{_METADATA} of its production",
         in_metres=bool(system),
@@ -297,7 +298,9 @@ def _focal_matrix(group: Element, focal: float | None) -> Double | None:
     entries = [_number(group, f"FisheyeFocalMatrix/M_{i}{k}") for i in (0, 1) for k in (0, 1)]
     if None not in entries:
         return np.array(entries, np.float64).reshape(2, 2)
-    return None if focal is None else np.diag([focal, focal * _aspect(group)]) * (np.pi / 2)
+    if focal is None or not focal > 0:  # it would turn the picture round
+        return None
+    return np.diag([focal, focal * _aspect(group)]) * (np.pi / 2)
 
 
 def _fisheye_terms(group: Element, source: Path) -> tuple[float, ...]:

@@ -4,7 +4,7 @@ camera and a pose by numbers, pictures lie in some folder, and a mesh that was e
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -97,19 +97,26 @@ def folder_of(path: Path) -> Path:
     return path if path.is_dir() else path.parent
 
 
-def _mask_called(name: str, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
+def _mask_called(
+    name: str, picture: Path, folder: Path, options: CaptureOptions, photographs: Container[Path]
+) -> Path | None:
     """The mask of this path: below the capture's folder by the end of the path, else beside its
-    picture, else in masks/; None where it lies nowhere there."""
+    picture, else in masks/; None where it lies nowhere there.
+
+    photographs  those whose radiance is taken, which may be called as their masks are"""
     parts = [
         part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..")
     ]
     inside = ["/".join(parts[i:]) for i in range(len(parts))]
     places = [folder / place for place in inside]
     places += [picture.parent / parts[-1], folder / "masks" / parts[-1]] if parts else []
-    found = next((p for p in places if os.path.isfile(p) and p != picture), None)
-    if found is None or not found.is_relative_to(folder):
-        return found
-    return path_in_capture(folder, found.relative_to(folder).as_posix(), options)
+    places = [place for place in places if place != picture and place not in photographs]
+    found = next(filter(os.path.isfile, places), None)
+    if found is None:
+        return None
+    # Of --frames elsewhere, no links lead out of the picture's own folder.
+    home = folder if found.is_relative_to(folder) else picture.parent
+    return path_in_capture(home, found.relative_to(home).as_posix(), options)
 
 
 def files_of_capture(folder: Path, *, meshes: tuple[str, ...]) -> list[Path]:
@@ -132,7 +139,7 @@ def scan_of_shots(
     pictures_in: tuple[str, ...] = (),
     meshes: tuple[str, ...],
     how: str,
-    tiles: Sequence[Path] = (),
+    tiles: Callable[[], Sequence[Path]] = tuple,
     up_axis: str | None = None,
     in_metres: bool = False,
     rim: bool = False,
@@ -143,7 +150,7 @@ def scan_of_shots(
     pictures_in     where the pictures lie below it, "" for there; empty: where most programs have
                     them
     meshes, how     patterns of the program's own names, and what to do where there is no mesh
-    tiles           files of one mesh, which is taken of them where no other is there
+    tiles           asked for the files of one mesh where no other is there
     up_axis         None where the format does not say
     rim             what is black along the pictures' borders is no part of them
     in_metres       False where the unit is that of the reconstruction, which nobody knows
@@ -172,7 +179,9 @@ def scan_of_shots(
             except ImageRefused as error:
                 findings.drop(shot.name, clause_of(error, image), "capture.image")
                 continue
-        mask = _mask_called(shot.mask, image, folder, options) if shot.mask else None
+        mask = None
+        if shot.mask:
+            mask = _mask_called(shot.mask, image, folder, options, pictures.instead)
         if shot.mask and mask is None:
             lacking.append(shot.mask)
         records.append(
@@ -200,20 +209,23 @@ def scan_of_shots(
         )
 
     def geometry() -> Path | ScanGeometry:
-        whole = any(next(folder.glob(pattern), None) for pattern in meshes)
-        if options.mesh is not None or whole or not tiles:
+        try:
             return mesh_beside(folder, options, *meshes, how=how)
+        except InputRefused as error:
+            if not str(error).endswith("[mesh.missing]") or not (some := tiles()):
+                raise
+        names = [tile.relative_to(folder).as_posix() for tile in some]
         findings.warn(
-            f"{source.name}: the mesh is that of {len(tiles)} tiles, first "
-            f"{tiles[0].relative_to(folder).as_posix()}. [mesh.tiles]"
+            f"{source.name}: the mesh is that of {len(names)} tiles, first {names[0]}. [mesh.tiles]"
         )
+        inside = [path_in_capture(folder, name, options) for name in names]
         return geometry_from_file(
-            tiles[0],
+            inside[0],
             options.objects,
             options,
             findings,
             capture_root=folder,
-            read=lambda _: mesh_of_tiles(tiles),
+            read=lambda _: mesh_of_tiles(inside),
         )
 
     return scan_of(
