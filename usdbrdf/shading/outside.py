@@ -449,14 +449,16 @@ def _as_pixels_mix(look: _Look, told: _Told) -> tuple[_Told, Double] | None:
 
 
 def on_the_same_wall(texels: Texels, index: Long, right: int, down: int) -> tuple[Long, Bool]:
-    """The texels beside those ``index``, (N,), as ``Texels.beside``; and which of them lie as far
-    away on the surface, (N,): others are of another part of it that has its place there."""
+    """The texels beside those ``index``, (N,), as ``Texels.beside``; and which of them lie about as
+    far away on the surface, (N,): others are of another part of it that has its place there."""
     beside = texels.beside(index, right, down).astype(np.int64)
     width = texels.resolution[texels.object_index()[index], 0]
     there = texels.pixel[beside] - texels.pixel[index] == right + down * width
     expected = texels.position[index] + right * texels.step_x[index] + down * texels.step_y[index]
     off = np.linalg.norm(texels.position[beside] - expected, axis=1)
-    return beside, there & (off < np.sqrt(texels.area[index]))
+    # Scanned walls are bumpy.
+    reach = (1 + math.hypot(right, down) / 2) * np.sqrt(texels.area[index])
+    return beside, there & (off < reach)
 
 
 def _of_measured(seen: Surroundings, z_up: bool) -> Environment:
