@@ -344,6 +344,12 @@ def _opened(path: Path, max_side: int) -> Any:
         raise ImageRefused(f"{path}: not a regular file. Name an image file. [image.unreadable]")
     if not os.access(path, os.R_OK):
         raise ImageRefused(f"{path}: permission denied. Make it readable. [image.unreadable]")
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:  # OpenImageIO would look for another file
+        raise ImageRefused(
+            f"{str(path)!r}: this name is not UTF-8. Rename the file. [image.unreadable]"
+        ) from error
     if status.st_size == 0:
         raise ImageRefused(f"{path}: the file is empty. Copy or export it again. [image.truncated]")
     # Without the hint, PNG's colours would come multiplied by their alpha.
