@@ -301,7 +301,7 @@ def test_a_photograph_whose_name_is_not_utf8_is_refused_with_that_reason(tmp_pat
     folder = tmp_path / "stack"
     _folder_of_photographs(folder, 4.0 ** -np.arange(3.0))
     (folder / "IMG_0.png").rename(folder / os.fsdecode(b"IMG\xff.png"))
-    with pytest.raises(InputRefused, match=r"not UTF-8\. Rename.*\[image\.unreadable\]$"):
+    with pytest.raises(InputRefused, match=r"not UTF-8\. Rename the file\. \[image\.unreadable\]$"):
         merge_brackets(folder, tmp_path / "merged")
 
 

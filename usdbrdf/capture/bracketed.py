@@ -42,7 +42,7 @@ _PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png"))
 _TELLING = 12
 # Between which exposures lie, in seconds or as EXIF data has them: far more than cameras do. What
 # is beyond makes radiance that no float holds.
-_SHORTEST, _LONGEST = 1e-12, 1e12
+_LEAST_EXPOSURE, _MOST_EXPOSURE = 1e-12, 1e12
 _LONGEST_STEM = 200  # bytes, of the 255 that file systems allow a name
 
 
@@ -206,7 +206,7 @@ def is_exposure(value: object) -> TypeGuard[float]:
     return (
         isinstance(value, int | float)
         and not isinstance(value, bool)
-        and _SHORTEST <= value <= _LONGEST
+        and _LEAST_EXPOSURE <= value <= _MOST_EXPOSURE
     )
 
 
