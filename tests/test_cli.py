@@ -725,6 +725,22 @@ def test_a_full_disk_behind_stdout(arguments):
     assert (status, err.count("\n")) == (4, 1)
 
 
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EIO, errno.ESTALE, errno.EMFILE])
+def test_what_the_machine_refuses_is_no_defect_wherever_it_comes(
+    capture, tmp_path, monkeypatch, capsys, code
+):
+    """As to ask for a file in a folder that one may not enter."""
+
+    def refused(*_arguments, **_options):
+        raise OSError(code, os.strerror(code), "layers/scan.usdc")
+
+    monkeypatch.setattr(pipeline, "ingest", refused)
+    assert main(["ingest", str(capture), "-o", str(tmp_path / "out")]) == 4
+    err = capsys.readouterr().err
+    assert err.startswith(f"usdbrdf: layers/scan.usdc: {os.strerror(code)}. Free disk")
+    assert err.endswith("[environment.io]\n")
+
+
 def test_a_defect_is_told_from_a_mistake(capture, tmp_path, monkeypatch, capsys):
     def broken(*_arguments, **_options):
         raise ZeroDivisionError("oops")

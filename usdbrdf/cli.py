@@ -29,10 +29,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse("interrupted; the same command goes on from here.", 130)
     except Terminated:
         return _refuse("terminated; the same command goes on from here.", 143)
-    except Exception:
+    except Exception as error:
+        with loading():
+            from usdbrdf.files.atomic import failure_of_machine
+        if (failure := failure_of_machine(error)) is not None:
+            return _refuse(str(failure), failure.exit_code)
         import traceback
 
-        tell(traceback.format_exc().rstrip())
+        tell("".join(traceback.format_exception(error)).rstrip())
         return _refuse("this is a defect of usdbrdf; please report it with the lines above.", 1)
 
 

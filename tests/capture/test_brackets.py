@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -285,6 +286,31 @@ def _folder_of_photographs(folder: Path, times: np.ndarray) -> None:
         _write_photograph(folder / f"IMG_{k}.png", codes, time=times[k])
 
 
+@pytest.mark.parametrize("name", [251 * "x", 62 * "\N{FIRE}", "IMG\n\x1b[31m"])
+def test_photographs_may_be_called_anything(tmp_path, name):
+    pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")
+    folder, merged = tmp_path / "stack", tmp_path / "merged"
+    _folder_of_photographs(folder, 4.0 ** -np.arange(3.0))
+    (folder / "IMG_0.png").rename(folder / f"{name}.png")
+    assert main(["merge-brackets", str(folder), "-o", str(merged), "-q"]) == 0
+    (frame,) = read_json(merged / "transforms.json")["frames"]
+    assert (merged / frame["file_path"]).is_file()
+
+
+def test_a_photograph_whose_name_is_not_utf8_is_refused_with_that_reason(tmp_path):
+    folder = tmp_path / "stack"
+    _folder_of_photographs(folder, 4.0 ** -np.arange(3.0))
+    (folder / "IMG_0.png").rename(folder / os.fsdecode(b"IMG\xff.png"))
+    with pytest.raises(InputRefused, match=r"not UTF-8\. Rename the file\. \[image\.unreadable\]$"):
+        merge_brackets(folder, tmp_path / "merged")
+
+
+def test_a_capture_that_is_not_there_is_told_whatever_lies_beside_it(tmp_path, capsys):
+    gone, beside = tmp_path / "gone", tmp_path / "merged"
+    assert main(["merge-brackets", str(gone), "-o", str(beside)]) == 3
+    assert str(gone) in capsys.readouterr().err.partition(":")[2]
+
+
 def test_photographs_of_a_folder_are_one_bracket(tmp_path):
     pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")
     folder, merged = tmp_path / "stack", tmp_path / "merged"
@@ -337,7 +363,16 @@ def test_a_lamp_that_clips_in_all_exposures_is_never_unknown(bracket):
 
 
 @pytest.mark.parametrize(
-    "fault", ["no exposure", "no brackets", "another size", "no file", "cut out", "logarithms"]
+    "fault",
+    [
+        "no exposure",
+        "no camera's exposure",
+        "no brackets",
+        "another size",
+        "no file",
+        "cut out",
+        "logarithms",
+    ],
 )
 def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
     pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")
@@ -345,6 +380,9 @@ def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
     first = capture.folder / "frames/2_1.png"
     if fault == "no exposure":
         write_preview_png(first, np.zeros((48, 64, 3), np.uint8))
+    if fault == "no camera's exposure":  # its radiance is beyond all floats
+        with edited(capture.manifest) as document:
+            document["frames"][0]["brackets"][0]["exposure_time"] = 1e-320
     if fault == "another size":
         _write_photograph(first, np.zeros((24, 64, 3), np.uint8), time=0.25)
     if fault == "no file":
@@ -361,6 +399,7 @@ def test_what_makes_no_brackets_is_refused(tmp_path, fault, capsys):
     assert main(["merge-brackets", str(capture.folder), "-o", str(tmp_path / "merged")]) == 3
     rule = {
         "no exposure": "[brackets.exposure]",
+        "no camera's exposure": "[brackets.exposure]",
         "no brackets": "[brackets.none]",
         "another size": "[brackets.size]",
         "no file": "[capture.file]",

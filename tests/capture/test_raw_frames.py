@@ -157,6 +157,29 @@ def test_what_cannot_be_developed_is_refused(capture, tmp_path, monkeypatch):
         develop_raw(capture, target)
 
 
+@pytest.mark.parametrize("exposure", [1e308, 1e-320])
+def test_exposures_that_no_camera_has_are_refused(capture, tmp_path, exposure):
+    with edited(capture / "transforms.json") as document:
+        document["frames"][0]["exposure_time"] = exposure
+    with pytest.raises(InputRefused, match=r"0000\.dng: '.*' is no exp.*\[raw\.exposure\]$"):
+        develop_raw(capture, tmp_path / "developed")
+
+
+def test_names_of_raw_files_may_be_as_long_as_file_systems_allow(capture, tmp_path):
+    with edited(capture / "transforms.json") as document:
+        name = document["frames"][0]["file_path"] = f"frames/{251 * 'x'}.dng"
+    (capture / "frames/0000.dng").rename(capture / name)
+    develop_raw(capture, tmp_path / "developed")
+    assert (tmp_path / f"developed/frames/00000_{200 * 'x'}.exr").is_file()
+
+
+def test_a_document_without_frames_is_refused(capture, tmp_path):
+    with edited(capture / "transforms.json") as document:
+        document["frames"] = []
+    with pytest.raises(InputRefused, match=r"no frames.*\[raw\.none\]$"):
+        develop_raw(capture, tmp_path / "developed")
+
+
 def test_frames_that_are_no_raw_files_are_refused(tmp_path):
     made = make_capture(tmp_path / "capture", frames=2)
     with pytest.raises(InputRefused, match=r"no camera raw file.*\[raw\.none\]$"):

@@ -132,6 +132,7 @@ def test_a_cycle_that_begins_elsewhere_is_refused(capture, tmp_path):
         ({"exposure_cycle": [0.1]}, "video.exposure"),
         ({"exposure_cycle": [0.1, 0.1]}, "video.exposure"),
         ({"exposure_cycle": [0.1, -1]}, "video.exposure"),
+        ({"exposure_cycle": [0.1, 1e-320]}, "video.exposure"),
         ({"exposure_cycle": None, "exposure_table": "table.csv"}, "document.missing"),
         ({"exposure_table": "table.csv"}, "video.exposure"),
     ],

@@ -13,6 +13,7 @@ import pytest
 
 from tests.fault_injection import run_fresh
 from tests.json_schemas import checked
+from tests.scenes import make_capture
 from usdbrdf.cli import main
 from usdbrdf.commands import COMMANDS
 from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, UsageError
@@ -56,6 +57,15 @@ def test_a_scan_is_there_once_however_often_and_by_whichever_way_it_is_named(tmp
     link.symlink_to(first)
     assert list_of([second, first, link, tmp_path / "b" / ".", second]).places == ("b", "a")
     assert list_of([link, second, first]).places == ("link", "b")
+
+
+def test_a_main_file_beside_its_folder_is_the_same_scan(tmp_path):
+    folder = make_capture(tmp_path / "a", frames=1).folder
+    other = folder / "night.json"
+    other.write_bytes((folder / "transforms.json").read_bytes())
+    assert list_of([folder / "transforms.json", folder]).places == ("a",)
+    assert list_of([folder, other]).places == ("a", "a/night.json")
+    assert list_of([folder / "transforms.json"]).places == ("transforms.json",)
 
 
 def test_openjd_makes_a_job_of_it(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -196,6 +197,7 @@ def test_only_what_trying_again_may_help_fails_the_task(one):
     assert run(InputRefused("bad."), FolderBusy("busy."), EnvironmentFailure("full.")) == (
         ["refused", "unfinished", "unfinished"], 5,
     )  # fmt: skip
+    assert run(PermissionError(errno.EACCES, "denied", "scan.usdc")) == (["unfinished"], 4)
     assert run(MemoryError()) == (["unfinished"], 4)
     assert heard[-1] == (1, "scan_0: unfinished")
     assert "--ram" in read_record(results.record("scan_0")).sentence

@@ -8,10 +8,11 @@ it is not stated is in their EXIF data.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -39,6 +40,10 @@ _SPACES = ("srgb_rec709_scene", "srgb_p3d65_scene")
 _PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png"))
 # Brackets that the response is told by.
 _TELLING = 12
+# Between which exposures lie, in seconds or as EXIF data has them: far more than cameras do. What
+# is beyond makes radiance that no float holds.
+_LEAST_EXPOSURE, _MOST_EXPOSURE = 1e-12, 1e12
+_LONGEST_STEM = 200  # bytes, of the 255 that file systems allow a name
 
 
 class Bracket(NamedTuple):
@@ -77,7 +82,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
         for i, bracket in enumerate(
             progress(brackets, total=len(brackets), label="brackets", unit="brackets")
         ):
-            name = f"frames/{i:05d}_{bracket.images[0].stem}.exr"
+            name = frame_of(i, bracket.images[0])
             made = _merged(bracket, response, staged / name, encoding)
             frames.append({**made.entry, "file_path": name})
             clipped.append(made.clipped)
@@ -190,6 +195,32 @@ def _aligned(bracket: Bracket) -> Aligned:
     return aligned(np.array(pictures), [path.name for path in bracket.images])
 
 
+def frame_of(number: int, photograph: Path) -> str:
+    """Where the frame of a photograph is written, called after it as far as names may be."""
+    stem = os.fsencode(photograph.stem)[:_LONGEST_STEM].decode("utf-8", "ignore")
+    return f"frames/{number:05d}_{stem}.exr"
+
+
+def is_exposure(value: object) -> TypeGuard[float]:
+    """Whether something stated is the exposure of a photograph."""
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and _LEAST_EXPOSURE <= value <= _MOST_EXPOSURE
+    )
+
+
+def exposure_of(photograph: Path, given: object, rule: str) -> float:
+    """What is stated of a photograph, else known of its file; InputRefused by ``rule`` where that
+    is no exposure."""
+    if not is_exposure(given):
+        said = f"{str(given)[:80]!r} is no exposure_time of a camera"
+        if given is None:
+            said = "no exposure_time is stated, and its EXIF data has none"
+        raise InputRefused(f"{photograph}: {said}. State the exposure in seconds. [{rule}]")
+    return float(given)
+
+
 def frames_of_document(source: Path, document: Any) -> list[dict[str, Any]]:
     """The entries of a transforms.json; InputRefused where it has none."""
     frames = document.get("frames") if isinstance(document, dict) else None
@@ -272,12 +303,7 @@ def _bracket(source: Path, entry: Mapping[str, Any], images: list[Any]) -> Brack
         given = image.get("exposure_time")
         if given is None:
             given = exif_exposure(path)
-        if isinstance(given, bool) or not isinstance(given, int | float) or not given > 0:
-            raise InputRefused(
-                f"{path}: no exposure_time is stated, and its EXIF data has none. State the "
-                "exposure in seconds. [brackets.exposure]"
-            )
+        exposures.append(exposure_of(path, given, "brackets.exposure"))
         paths.append(path)
-        exposures.append(float(given))
     order = np.argsort([-exposure for exposure in exposures], kind="stable")
     return Bracket(entry, tuple(paths[i] for i in order), np.array(exposures)[order])

@@ -36,7 +36,8 @@ def refuse_taken(folder: Path, capture: Path) -> None:
             f"{folder}: there is something already, and a capture is never written over. Name a "
             "new folder. [ownership.taken]"
         )
-    source = (capture if capture.is_dir() else capture.parent).resolve()
+    # One that is not there is told by who reads it, whatever lies beside it.
+    source = (capture.parent if capture.is_file() else capture).resolve()
     if folder.resolve().is_relative_to(source):
         raise OwnershipConflict(
             f"{folder}: lies inside the capture {source}, which would change by it. Name a folder "

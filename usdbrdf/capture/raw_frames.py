@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf import calibration
-from usdbrdf.capture.bracketed import copy_beside, frames_of_document
+from usdbrdf.capture.bracketed import copy_beside, exposure_of, frame_of, frames_of_document
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.documents import read_json, write_json
@@ -38,6 +38,8 @@ def develop_raw(capture: Path, folder: Path) -> dict[str, Any]:
     source = capture / "transforms.json" if capture.is_dir() else capture
     document = read_json(source, nonfinite_below=("transform_matrix",))
     entries = frames_of_document(source, document)
+    if not entries:
+        raise InputRefused(f"{source}: names no frames. Name the raw files as such. [raw.none]")
     files = [_raw_file(source, entry) for entry in entries]
     shown = progress(files, total=len(files), label="white balance", unit="frames")
     # Of each file twice, as all of them do not fit into memory.
@@ -46,14 +48,14 @@ def develop_raw(capture: Path, folder: Path) -> dict[str, Any]:
     )
     balance = np.median(np.array(balances), axis=0)
     drift = np.abs(np.log2(np.array(balances) / balance)).max(axis=1)
-    exposures = _exposures(source, entries, told)
+    exposures = _exposures(files, entries, told)
     scales = np.median(exposures) / exposures
     frames, clipped = [], []
     with environment_failures(str(folder)), whole_folder(folder) as staged:
         (staged / "frames").mkdir()
         numbered = progress(list(enumerate(files)), total=len(files), label="raw", unit="frames")
         for i, file in numbered:
-            name = f"frames/{i:05d}_{file.stem}.exr"
+            name = frame_of(i, file)
             picture = _as_stated(raw_picture(file), _stated_size(document, entries[i]))
             pixels, saturation, share = developed_raw(picture, balance, scales[i])
             write_exr(staged / name, pixels, half=not needs_float(pixels))
@@ -135,13 +137,11 @@ def _raw_file(source: Path, entry: dict[str, Any]) -> Path:
     return path
 
 
-def _exposures(source: Path, entries: Sequence[dict[str, Any]], told: Sequence[float]) -> Double:
+def _exposures(
+    files: Sequence[Path], entries: Sequence[dict[str, Any]], told: Sequence[float | None]
+) -> Double:
     """(N,) as stated, else as the files tell."""
     given = [entry.get("exposure_time", own) for entry, own in zip(entries, told, strict=True)]
-    for entry, exposure in zip(entries, given, strict=True):
-        if isinstance(exposure, bool) or not isinstance(exposure, int | float) or not exposure > 0:
-            raise InputRefused(
-                f"{source}: no exposure_time is stated for {entry.get('file_path')}, and the file "
-                "tells none. State the exposure in seconds. [raw.exposure]"
-            )
-    return np.array(given, np.float64)
+    return np.array(
+        [exposure_of(f, e, "raw.exposure") for f, e in zip(files, given, strict=True)], np.float64
+    )

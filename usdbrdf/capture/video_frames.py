@@ -18,7 +18,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.capture.alignment import aligned
-from usdbrdf.capture.bracketed import copy_beside, frames_of_document
+from usdbrdf.capture.bracketed import copy_beside, frames_of_document, is_exposure
 from usdbrdf.capture.brackets import BRIGHT_CODE, DARK_CODE, Response, merge, response_from_brackets
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused
@@ -160,7 +160,7 @@ def _exposures(
         stated: dict[int, float] = {}
         for row in csv_rows(place):
             number, time = number_in(row, "frame"), number_in(row, "exposure_time")
-            if number is None or time is None or time <= 0 or number % 1 or number in stated:
+            if number is None or not is_exposure(time) or number % 1 or number in stated:
                 raise InputRefused(
                     f"{place}: the row {str(row)[:80]} has no frame of its own and no "
                     "exposure_time above 0. Correct it. [video.exposure]"
@@ -168,7 +168,7 @@ def _exposures(
             stated[int(number)] = time
         return stated, 0
     known = isinstance(cycle, list) and 2 <= len(cycle) <= MOST_FRAMES and table is None
-    if not known or not all(type(t) in (int, float) and 0 < t < np.inf for t in cycle or ()):
+    if not known or not all(map(is_exposure, cycle or ())):
         raise InputRefused(
             f'{source}: the exposures of its video are stated neither as "exposure_cycle", a list '
             'of two or more in seconds, nor in an "exposure_table". State one of them. '

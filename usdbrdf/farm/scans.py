@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from usdbrdf.capture.adapters import choose_adapter
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.documents import read_json, read_text
 from usdbrdf.files.naming import unique_identifiers
@@ -16,6 +17,7 @@ from usdbrdf.files.naming import unique_identifiers
 SCANS_FILE = "scans.json"
 RESULTS_FOLDER = "results"
 _SCHEMA = 1
+_MAIN_FILE = "transforms.json"
 _RANGE = re.compile(r"(\d{1,9})(?:-(\d{1,9})(?::([1-9]\d{0,8}))?)?")
 
 
@@ -62,12 +64,25 @@ def list_of(scans: Sequence[Path], known: Mapping[str, Path] | None = None) -> S
             f"{missing[0]}: no such file or folder{more}. Correct the path; nothing was written. "
             "[farm.scan]"
         )
+    places = [place for place in places if not _is_read_with_its_folder(place, once)]
     root = Path(os.path.commonpath([place.parent for place in places]))
     return ScanList(
         root=root,
         names=tuple(_names(places, known or {})),
         places=tuple(place.relative_to(root).as_posix() for place in places),
     )
+
+
+def _is_read_with_its_folder(scan: Path, once: Mapping[str, Path]) -> bool:
+    """Whether a scan is the main file of a folder that is named too. Of another name it may be of
+    other frames, and who has formats that come first reads the folder by these."""
+    folder = Path(os.path.realpath(scan)).parent
+    if scan.name != _MAIN_FILE or not scan.is_file() or str(folder) not in once:
+        return False
+    try:
+        return choose_adapter(folder, plugins=False).name == "transforms"
+    except InputRefused:
+        return False
 
 
 def _names(wanted: Sequence[Path], known: Mapping[str, Path]) -> list[str]:

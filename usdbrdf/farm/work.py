@@ -16,7 +16,7 @@ from pathlib import Path
 from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import EnvironmentFailure, FolderBusy, UsdBrdfError
 from usdbrdf.farm.records import Record, Results, Status, read_record, write_record
-from usdbrdf.files.atomic import environment_failures
+from usdbrdf.files.atomic import environment_failures, failure_of_machine
 from usdbrdf.job.progress import printable, say, tell
 from usdbrdf.job.stamp import STATE_FOLDER, code_version, hash_of_files
 from usdbrdf.job.task import TaskResult
@@ -88,15 +88,22 @@ def _worked_on(name: str, place: Path, work: Work) -> tuple[Record, int]:
             code = EnvironmentFailure.exit_code
             record = _failed(before, sentence, code)
         except Exception as error:
-            tell(traceback.format_exc().rstrip())
-            sentence = f"a defect of usdbrdf ({type(error).__name__}). Report it. [farm.defect]"
-            record, code = _failed(before, sentence, 1), 1
+            sentence, code = _unexpected(error)
+            record = _failed(before, sentence, code)
         except BaseException:  # stopped from outside, which is none of its tries
             write_record(file, replace(before, status="begun", begun=begun))
             raise
     with environment_failures(str(file)):
         write_record(file, record)
     return record, code
+
+
+def _unexpected(error: Exception) -> tuple[str, int]:
+    """What is said of an error that nobody expected, and its exit code."""
+    if (failure := failure_of_machine(error)) is not None:
+        return str(failure), failure.exit_code
+    tell("".join(traceback.format_exception(error)).rstrip())
+    return f"a defect of usdbrdf ({type(error).__name__}). Report it. [farm.defect]", 1
 
 
 def _crashed(before: Record) -> Record:

@@ -27,6 +27,11 @@ _MACHINE = hashlib.sha256(socket.gethostname().encode("utf-8", "replace")).hexdi
 _TEMPORARY = re.compile(
     rf"(?P<name>{re.escape(TEMPORARY_PREFIX)}{_MACHINE}-(?P<process>[1-9]\d*)-[0-9a-f]{{8}})(\..*)?"
 )
+# Of these calls may fail that ask for nothing but what is right.
+_OF_THE_MACHINE = {
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE,
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM, errno.ETIMEDOUT,
+}  # fmt: skip
 _own: set[str] = set()  # names in use by this process, its threads, and those it was forked from
 _swept: set[Path] = set()  # once in a process is enough
 
@@ -234,11 +239,24 @@ def environment_failures(subject: str) -> Iterator[None]:
                 f"{subject}: out of memory. Free some or use a larger machine, then run the same "
                 "command again; finished work is kept. [environment.memory]"
             ) from error
-        where = f" ({place!r})" if (place := _place_of(error)) else ""
+        place = _place_of(error)
+        where = f" ({place!r})" if place and str(place) != subject else ""
         raise EnvironmentFailure(
             f"{subject}: {error.strerror or error}{where}. Free disk space or correct the "
             "permission, then run the same command again; finished work is kept. [environment.io]"
         ) from error
+
+
+def failure_of_machine(error: Exception) -> EnvironmentFailure | None:
+    """What an error comes to that nobody expected where it came from: of permission, disk or open
+    files it is the machine's whoever asks, say whether there is a file; else None, a defect."""
+    if not isinstance(error, OSError) or error.errno not in _OF_THE_MACHINE:
+        return None
+    try:
+        with environment_failures(str(_place_of(error) or "this machine")):
+            raise error
+    except EnvironmentFailure as failure:
+        return failure
 
 
 def _place_of(error: OSError) -> object:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +21,7 @@ import OpenImageIO as oiio
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
 from usdbrdf.files.channels import colours_of, layers_with_colours
+from usdbrdf.files.paths import why_unreadable
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Bool, Byte, Float
 
@@ -333,18 +333,10 @@ def _opened(path: Path, max_side: int) -> Any:
             f"{path}: camera raw files are not read here (only their preview would be). Let "
             "`usdbrdf develop-raw` make a capture of radiance of them. [image.raw]"
         )
-    try:
-        status = path.stat()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ImageRefused(
-            f"{path}: cannot be read ({reason}). Check name and permission. [image.unreadable]"
-        ) from error
-    if not stat.S_ISREG(status.st_mode):  # a FIFO would block for ever
-        raise ImageRefused(f"{path}: not a regular file. Name an image file. [image.unreadable]")
-    if not os.access(path, os.R_OK):
-        raise ImageRefused(f"{path}: permission denied. Make it readable. [image.unreadable]")
-    if status.st_size == 0:
+    if (why := why_unreadable(path)) is not None:
+        raise ImageRefused(f"{path}: {why}. [image.unreadable]")
+    size = path.stat().st_size
+    if size == 0:
         raise ImageRefused(f"{path}: the file is empty. Copy or export it again. [image.truncated]")
     # Without the hint, PNG's colours would come multiplied by their alpha.
     hint = oiio.ImageSpec()
@@ -360,7 +352,7 @@ def _opened(path: Path, max_side: int) -> Any:
             f"{path}: {source.format_name()} {'deep or volume ' if spec.deep else ''}images are "
             f"not read. Export a flat image ({', '.join(_FORMATS)}). [image.format]"
         )
-    _check_limits(path, spec, status.st_size, max_side)
+    _check_limits(path, spec, size, max_side)
     return source
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from contextlib import suppress
 from pathlib import Path
 
@@ -73,6 +74,21 @@ def refuse_nameless(path: Path | None) -> None:
             f"{str(path)!r}: this name, or that of a folder above, is not UTF-8, so that USD "
             "cannot refer to it. Rename it. [paths.name]"
         ) from error
+
+
+def why_unreadable(image: Path) -> str | None:
+    """Why no library could open an image's file, and what to do; None where it may."""
+    try:
+        status = image.stat()
+        str(image).encode()
+    except UnicodeEncodeError:  # it would look for another
+        return "its name is not UTF-8. Rename the file"
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        return f"cannot be read ({reason}). Check name and permission"
+    if not stat.S_ISREG(status.st_mode):  # a FIFO would block for ever
+        return "not a regular file. Name an image file"
+    return None if os.access(image, os.R_OK) else "permission denied. Make it readable"
 
 
 def refuse_lost_folder() -> None:

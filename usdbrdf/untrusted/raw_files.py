@@ -32,15 +32,15 @@ class RawPicture:
                    as the camera's own JPEG shows it; all of it where the file says nothing
     white_balance  (3,) float64, factors as shot, of which green's is 1
     rec709_from_camera  (3, 3) float64, of balanced channels; white stays white
-    exposure       time in seconds x ISO / 100 / f-number^2, as far as the file tells; NaN without
-                   a time
+    exposure       time in seconds x ISO / 100 / f-number^2, as far as the file tells; None
+                   without a time
     """
 
     sensor: Float
     crop: tuple[int, int, int, int]
     white_balance: Double
     rec709_from_camera: Double
-    exposure: float
+    exposure: float | None
 
 
 def raw_picture(path: Path) -> RawPicture:
@@ -95,7 +95,7 @@ def read_here(path: Path) -> RawPicture:
         crop=_crop(sizes, *sensor.shape[:2]),
         white_balance=given / given[1],
         rec709_from_camera=matrix,
-        exposure=exposure if known else math.nan,
+        exposure=exposure if known else None,
     )
 
 
