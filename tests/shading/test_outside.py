@@ -439,7 +439,7 @@ def test_means_keep_to_the_wall_where_another_lies_beside_it_in_the_atlas():
     every = np.arange(len(texels))
     left = texels.position[:, 0] < 5
     for right in (-4, -2, 2, 4):
-        beside, there = outside.on_the_same_wall(texels, every, right, 0)
+        beside, there = texels.beside_on_surface(every, right, 0)
         np.testing.assert_array_equal(left[beside[there]], left[there])
         # All but the columns at the end of each.
         assert there.sum() == 2 * 20 * (19 - abs(right))

@@ -210,7 +210,7 @@ def with_rims(
             project is called says nothing
     """
     folder, frames = places
-    folders = [folder, *([*frames.resolve().parents[:2]][-1:] if frames is not None else [])]
+    folders = [folder, *([] if frames is None else frames.resolve().parents[:2][-1:])]
     if any(record.rim for record in records):
         return list(records)
     undistorted = [

@@ -234,17 +234,21 @@ def environment_failures(subject: str) -> Iterator[None]:
     except BrokenPipeError:
         raise  # whoever read our output has gone: no fault of this machine
     except (MemoryError, OSError) as error:
-        if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
-            raise EnvironmentFailure(
-                f"{subject}: out of memory. Free some or use a larger machine, then run the same "
-                "command again; finished work is kept. [environment.memory]"
-            ) from error
-        place = _place_of(error)
-        where = f" ({place!r})" if place and str(place) != subject else ""
-        raise EnvironmentFailure(
-            f"{subject}: {error.strerror or error}{where}. Free disk space or correct the "
-            "permission, then run the same command again; finished work is kept. [environment.io]"
-        ) from error
+        raise _failure(subject, error) from error
+
+
+def _failure(subject: str, error: MemoryError | OSError) -> EnvironmentFailure:
+    if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
+        return EnvironmentFailure(
+            f"{subject}: out of memory. Free some or use a larger machine, then run the same "
+            "command again; finished work is kept. [environment.memory]"
+        )
+    place = _place_of(error)
+    where = f" ({place!r})" if place and str(place) != subject else ""
+    return EnvironmentFailure(
+        f"{subject}: {error.strerror or error}{where}. Free disk space or correct the "
+        "permission, then run the same command again; finished work is kept. [environment.io]"
+    )
 
 
 def failure_of_machine(error: Exception) -> EnvironmentFailure | None:
@@ -252,11 +256,7 @@ def failure_of_machine(error: Exception) -> EnvironmentFailure | None:
     files it is the machine's whoever asks, say whether there is a file; else None, a defect."""
     if not isinstance(error, OSError) or error.errno not in _OF_THE_MACHINE:
         return None
-    try:
-        with environment_failures(str(_place_of(error) or "this machine")):
-            raise error
-    except EnvironmentFailure as failure:
-        return failure
+    return _failure(str(_place_of(error) or "this machine"), error)
 
 
 def _place_of(error: OSError) -> object:

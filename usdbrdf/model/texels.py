@@ -4,6 +4,7 @@ know of its lit radiance.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -125,6 +126,18 @@ class Texels:
         row = np.clip(row + down, 0, height - 1)
         texel = self.nearest_texel[self.first_pixel[owner] + row * width + column]
         return np.where(texel >= 0, texel, index).astype(np.int32)
+
+    def beside_on_surface(self, index: Long, right: int, down: int) -> tuple[Long, Bool]:
+        """``beside``, and which of those (N,) lie about as far away on the surface: others are of
+        another part of it that has its place there."""
+        beside = self.beside(index, right, down).astype(np.int64)
+        width = self.resolution[self.object_index()[index], 0]
+        there = self.pixel[beside] - self.pixel[index] == right + down * width
+        expected = self.position[index] + right * self.step_x[index] + down * self.step_y[index]
+        off = np.linalg.norm(self.position[beside] - expected, axis=1)
+        # Scanned walls are bumpy.
+        reach = (1 + math.hypot(right, down) / 2) * np.sqrt(self.area[index])
+        return beside, there & (off < reach)
 
     def around(self, index: Long, apart: int) -> Iterator[Long]:
         """The texels, (N,) each, that lie ``apart`` pixels of an atlas from texels ``index`` (N,),

@@ -20,9 +20,9 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
+from usdbrdf.model.arrays import Array, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.texels import CoverageMap, Texels
+from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading.asked import (
     LEAST_OF_SEGMENT,
     PER_SEGMENT,
@@ -431,7 +431,7 @@ def _as_pixels_mix(look: _Look, told: _Told) -> tuple[_Told, Double] | None:
     reflected, share = np.zeros_like(asked.reflected), np.zeros(len(centre))
     sunny = np.zeros(len(centre), np.bool_)
     for right, down in product(_MIXED, repeat=2):
-        beside, there = on_the_same_wall(texels, centre, right, down)
+        beside, there = texels.beside_on_surface(centre, right, down)
         own = sunlit(surface, beside, told.sun, look.seed)
         whole &= there & look.coverage.measured[beside]
         sunny |= there & (own > 0)
@@ -446,19 +446,6 @@ def _as_pixels_mix(look: _Look, told: _Told) -> tuple[_Told, Double] | None:
     with_sun = mixed.of(kept), sources._replace(share=sources.share[:, kept])
     found = solved(*with_sun)
     return told._replace(with_sun=with_sun, found=found), jackknife(*with_sun, found)
-
-
-def on_the_same_wall(texels: Texels, index: Long, right: int, down: int) -> tuple[Long, Bool]:
-    """The texels beside those ``index``, (N,), as ``Texels.beside``; and which of them lie about as
-    far away on the surface, (N,): others are of another part of it that has its place there."""
-    beside = texels.beside(index, right, down).astype(np.int64)
-    width = texels.resolution[texels.object_index()[index], 0]
-    there = texels.pixel[beside] - texels.pixel[index] == right + down * width
-    expected = texels.position[index] + right * texels.step_x[index] + down * texels.step_y[index]
-    off = np.linalg.norm(texels.position[beside] - expected, axis=1)
-    # Scanned walls are bumpy.
-    reach = (1 + math.hypot(right, down) / 2) * np.sqrt(texels.area[index])
-    return beside, there & (off < reach)
 
 
 def _of_measured(seen: Surroundings, z_up: bool) -> Environment:
