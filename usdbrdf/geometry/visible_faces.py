@@ -272,3 +272,24 @@ def _points(first: int, last: int, camera: _Pinhole, nearness: Float, point: Flo
             for k in range(3):
                 d = m[0, k] * x + m[1, k] * y + m[2, k]
                 point[row, column, k] = camera.eye[k] + d / w if w > 0 else 0.0
+
+
+@kernel
+def place_on_face(points: Float, triangles: Int, f: int, p: Float) -> tuple[float, float]:
+    """Barycentric (u, v) of the point p (3,) on triangle f, by least squares, for it lies in its
+    plane; (-1, -1) of a triangle without an area."""
+    a, b, c = triangles[f]
+    e00, e01, e11, r0, r1 = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        along = np.float64(points[b, k]) - points[a, k]
+        aside = np.float64(points[c, k]) - points[a, k]
+        off = np.float64(p[k]) - points[a, k]
+        e00 += along * along
+        e01 += along * aside
+        e11 += aside * aside
+        r0 += along * off
+        r1 += aside * off
+    determinant = e00 * e11 - e01 * e01
+    if determinant <= 0:
+        return -1.0, -1.0
+    return (e11 * r0 - e01 * r1) / determinant, (e00 * r1 - e01 * r0) / determinant

@@ -28,6 +28,7 @@ from usdbrdf.shading.base_color import Reflection, base_color_of
 from usdbrdf.shading.hidden_light import beside_seen, without_leaks
 from usdbrdf.texturing.footprints import around, footprints, restored, widest
 from usdbrdf.texturing.inpaint import inpaint
+from usdbrdf.texturing.light_on_pixels import beside_own_light
 from usdbrdf.texturing.observe import frames_in_view, samples_from_frames, spread_order
 from usdbrdf.texturing.passes import (
     BytesPerTexel,
@@ -47,6 +48,7 @@ from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
 from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.let_through import share_let_through, share_seen
 from usdbrdf.transport.lit_scene import LitScene
+from usdbrdf.transport.surface_texture import SurfaceTexture
 from usdbrdf.transport.warps import shifts_of
 
 # Of a texel that more frames see than this, so many are taken on the average, spread over all: what
@@ -55,7 +57,7 @@ _MOST_SAMPLES = 24
 # Bytes that a texel takes: its state (132), its place among the blocks of texels while these are
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
 # and what it is lit by, with and without what its surface keeps.
-_OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24)
+_OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24, pixel=240)
 _OF_PATTERNS = BytesPerTexel(grouped=BYTES_OF_EQUATIONS, result=28, after=60, always=44, pixel=450)
 RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")
@@ -211,8 +213,11 @@ def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> tu
     # Too dark for a sample in any frame: there is nothing to take off.
     dark = before.coverage.measured & ~known & ~emissive
     shown = np.where(dark[:, None], before.lit, np.maximum(found.mean * level[:, None], 0))
-    filled_in = inpaint(texels, shown, known | dark)
-    diffuse = restored(texels, filled_in, known, found.variance * level**2, found.footprint)
+    # The light's own contrast was never blurred, see ``light_on_pixels``: that of the surface was.
+    light = _light(before)
+    variance = found.variance * (level / light.mean(axis=1)) ** 2
+    albedo = inpaint(texels, np.asarray(shown / light, np.float32), known | dark)
+    diffuse = light * restored(texels, albedo, known, variance, found.footprint)
     diffuse = np.where(emissive[:, None], before.emission, np.maximum(diffuse, 0))
     # What clips in every frame is at least as bright as that.
     clipped = before.coverage.clipped[:, None]
@@ -221,6 +226,13 @@ def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> tu
     relative = np.maximum(found.mean.mean(axis=1), 1e-3)
     error = np.where(known, np.sqrt(found.variance) / relative, np.inf)
     return diffuse, error.astype(np.float32)
+
+
+def _light(before: LightBefore) -> Float:
+    """(T, 3): S of each texel, W/m^2, and no less than a little."""
+    light = before.irradiance
+    light = np.maximum(light, max(_DARKEST * float(np.median(light.mean(axis=1))), 1e-30))
+    return np.asarray(light, np.float32)
 
 
 def _level(lit: Float) -> Float:
@@ -243,7 +255,8 @@ def _means_without_lobes(
     ``_level`` of their lit radiance, in as many passes over the frames as ``memory`` (GiB) asks
     for."""
     _, lit, before, own = lighting
-    shown = _Shown(lit, before.samples, lobes, _level(before.lit), reader, own, seed)
+    light = lit.radiance.showing(lit.texels, _light(before))
+    shown = _Shown(lit, before.samples, lobes, _level(before.lit), light, reader, own, seed)
 
     def means(part: slice) -> dict[str, Array]:
         """Of some texels, going on from the last saved state of an interrupted run."""
@@ -273,12 +286,13 @@ def _means_without_lobes(
 
 class _Shown(NamedTuple):
     """What the frames ``own`` of a lighting show: a scene with lobes, how many measured each texel,
-    (T,), and the radiance that its samples are relative to, (T,)."""
+    (T,), the radiance that its samples are relative to, (T,), and S as a texture."""
 
     lit: LitScene
     samples: Float
     lobes: Lobes
     level: Float
+    light: SurfaceTexture
     reader: FrameReader
     own: range
     seed: int
@@ -287,7 +301,7 @@ class _Shown(NamedTuple):
 def _with_frames(shown: _Shown, part: slice, start: int, observed: MeanState) -> Iterator[int]:
     """Add the frames from the place ``start`` on in their order to what was observed of the texels
     of ``part``, and give the place of each that is in it."""
-    lit, samples, lobes, level, reader, own, seed = shown
+    lit, samples, lobes, level, light, reader, own, seed = shown
     frames, texels = reader.frames, lit.texels
     owner = texels.object_index()
     # The mean starts from its first samples, which must not all show one highlight.
@@ -311,7 +325,8 @@ def _with_frames(shown: _Shown, part: slice, start: int, observed: MeanState) ->
         wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
         error = np.sqrt(RELATIVE_ERROR**2 + noise**2 + of_lobe**2)
         deviation = np.asarray(error * wide, np.float32)
-        values = (some.radiance[taken] - specular) / unit[:, None]
+        uneven = beside_own_light(lit, light, texel, camera)
+        values = (some.radiance[taken] - specular) / (unit[:, None] * uneven)
         own_texel = texel[within] - np.int32(part.start)
         update(observed, own_texel, values[within], deviation[within], covered[within])
         yield done
@@ -441,6 +456,7 @@ def _need(lightings: Sequence[LitScene]) -> BytesPerTexel:
         lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
         for lit in lightings
     )
+    light += lightings[0].radiance.pixels.nbytes  # S as a texture, of one at a time
     always = len(lightings) * _OF_REFINING.always + light // len(lightings[0].texels)
     return _OF_REFINING._replace(always=always)
 

@@ -41,6 +41,11 @@ class Camera:
         """The same picture, so wide, its pixels' shape kept as nearly as can be."""
         return self.at_size(width, max(1, round(self.height * width / self.width)))
 
+    def rows(self, low: int, high: int) -> Camera:
+        """The same picture's rows from ``low`` to ``high``, which may lie beyond its border."""
+        fx, fy, cx, cy = self.intrinsics
+        return replace(self, intrinsics=(fx, fy, cx, cy - low), height=high - low)
+
     def pixels(self, stride: int = 1) -> Double:
         """(R, 2) x, y of every ``stride``-th pixel's centre, row by row."""
         x = np.arange(0, self.width, stride) + 0.5

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from usdbrdf import calibration
-from usdbrdf.geometry.visible_faces import visible_faces
+from usdbrdf.geometry.visible_faces import place_on_face, visible_faces
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
@@ -115,23 +115,9 @@ def _places(
             f = face[j, i]
             if f < 0:
                 continue
-            a, b, c = triangles[f]
-            # Barycentric coordinates by least squares: the point lies in the plane.
-            e00, e01, e11, r0, r1 = 0.0, 0.0, 0.0, 0.0, 0.0
-            for k in range(3):
-                along = np.float64(points[b, k]) - points[a, k]
-                aside = np.float64(points[c, k]) - points[a, k]
-                off = np.float64(point[j, i, k]) - points[a, k]
-                e00 += along * along
-                e01 += along * aside
-                e11 += aside * aside
-                r0 += along * off
-                r1 += aside * off
-            determinant = e00 * e11 - e01 * e01
-            if determinant <= 0:
+            u, v = place_on_face(points, triangles, f, point[j, i])
+            if u < 0 and v < 0:
                 continue
-            u = (e11 * r0 - e01 * r1) / determinant
-            v = (e00 * r1 - e01 * r0) / determinant
             for k in range(2):
                 q = corner_pixel[f]
                 where[j, i, k] = (1 - u - v) * q[0, k] + u * q[1, k] + v * q[2, k]
