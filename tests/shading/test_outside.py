@@ -11,7 +11,9 @@ from tests.physics.surfaces import Sampling, box, quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading import outside, sky_patches
+from usdbrdf.shading.asked import Shining, asked_texels, irradiance_of_texels
 from usdbrdf.shading.outside import Outside, light_from_outside
+from usdbrdf.shading.sun_direction import with_disc
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings
 from usdbrdf.shading.unseen_lamps import lamps_that_explain
 from usdbrdf.texturing.footprints import blurred
@@ -422,6 +424,33 @@ def test_where_pixels_mix_all_stripes_of_shadow_their_means_tell_the_sun(monkeyp
     monkeypatch.setattr(outside, "_as_pixels_mix", lambda *_: None)
     found, _ = _under_stripes(0.21)
     assert (found.environment.sun.irradiance < 0.6 * SUN.irradiance).all()
+
+
+@pytest.mark.parametrize("half_angle", [0.00465, 0.035])
+def test_half_shadows_tell_how_wide_the_sun_is(half_angle: float):
+    """And where it stands, from a direction that is off by more than its disc."""
+    surface, lit, _ = _lit(
+        _pergola(0.3), Environment(SKY, True).under(SUN._replace(half_angle=half_angle)), 0.05
+    )
+    texels = surface.texels
+    lit = blurred(texels, lit, np.tile(np.float32([0.5, 0, 0.5]), (len(texels), 1)))
+    every = np.ones(len(lit), np.bool_)
+    asked = asked_texels(texels, lit, CoverageMap.of(every, ~every), 1)
+    assert asked is not None
+    in_shadow = irradiance_of_texels(
+        surface, Shining.of(surface, lit, Environment(SKY, True)), Environment(SKY, True),
+        asked.texel, 2,
+    )  # fmt: skip
+    off = SUN._replace(direction=_turned(TOWARDS, 0.01), irradiance=0.7 * SUN.irradiance)
+    found = with_disc(surface, asked, in_shadow.astype(np.float64), off, 3)
+    assert found.direction @ TOWARDS > np.cos(np.radians(0.3))
+    assert 0.6 < found.half_angle / half_angle < 1.6
+
+
+def _turned(direction: np.ndarray, angle: float) -> np.ndarray:
+    across = np.cross(direction, [0, 0, 1])
+    turned = direction + angle * across / np.linalg.norm(across)
+    return turned / np.linalg.norm(turned)
 
 
 def test_means_keep_to_the_wall_where_another_lies_beside_it_in_the_atlas():

@@ -50,7 +50,7 @@ from usdbrdf.shading.sky_patches import (
     shares_of_sky,
     sources_in_sky,
 )
-from usdbrdf.shading.sun_direction import find_sun
+from usdbrdf.shading.sun_direction import find_sun, with_disc
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings, surroundings_from_frames
 from usdbrdf.transport.environment import NO_SUN, Environment, Sun
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -65,6 +65,8 @@ _MANY_PER_SEGMENT, _AROUND, _AS_SUNLIT = 960, 2, 0.05
 _MIXED = (-4, -2, 0, 2, 4)
 # What surfaces mirror follows from the light that was found before; then it is as it was told.
 _LOOKS_AT_MIRRORED, _AS_TOLD = 2, (1.0, 0.0)
+# With the disc that was found the sun is stronger, and its disc is looked at again.
+_LOOKS_AT_DISC = 2
 # Where more of the sunlit texels are clear of shadows than this, all of them tell more.
 _MOSTLY_CLEAR = 0.5
 _LEAST_SHARE = calibration.number("outside.least_share")
@@ -210,7 +212,7 @@ def light_from_outside(
         told = _beside_mirrored(look, told)
     error = jackknife(*told.with_sun, told.found)
     sun_shines = _sun_shines(told, error)
-    told, error = _beside_blurred(look, told, error) if sun_shines else _sunless(look, told)
+    told, error = _in_shadows(look, told) if sun_shines else _sunless(look, told)
     found = levelled(*told.with_sun, told.found)
     sky, of_sky = np.exp(found.log_radiance[: len(look.used)]), error[: len(look.used)].max(axis=1)
     # By the light that each brings: nobody asks how dark dark ground is.
@@ -381,13 +383,21 @@ def _sunless(look: _Look, told: _Told) -> tuple[_Told, Double]:
     return told, jackknife(*without_sun, found)
 
 
-def _beside_blurred(look: _Look, told: _Told, error: Double) -> tuple[_Told, Double]:
-    """The same with the sun as it is told best where shadows are blurred, and the errors, (K, 3).
+def _in_shadows(look: _Look, told: _Told) -> tuple[_Told, Double]:
+    """The same with the sun's disc as half-shadows show it, and as strong as it is told best where
+    shadows are blurred; and the errors, (K, 3).
 
     Pixels mix sunlight and shadow, most so in the stripes of blinds: what then is too bright in the
     shadows passes for light from all around the sun, and what is too dark between them for a weak
     one. Two ways around that: texels that lie clear of shadows' edges, where there are such; and
     means over more than a pixel, which are those of what falls there, whatever it mixes."""
+    for _ in range(_LOOKS_AT_DISC):
+        sun = told.sun._replace(irradiance=np.exp(told.found.log_radiance[-1]))
+        found = with_disc(look.surface, told.asked, told.light(), sun, look.seed)
+        if found is sun:
+            break
+        told = _solved(look, told.asked, told.sources, found)
+    error = jackknife(*told.with_sun, told.found)
     ways = [_clear_of_shadows(look, told, error), _as_pixels_mix(look, told)]
     well = [way for way in ways if way and way[1][-1].max() < _MOST_CLEAR_ERROR]
     return min(well, key=lambda way: float(way[1][-1].max()), default=(told, error))

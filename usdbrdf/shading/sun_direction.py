@@ -6,6 +6,7 @@ the right one, and the right strength, what is left of the contrasts on each seg
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 
 import numpy as np
 
@@ -13,9 +14,10 @@ from usdbrdf import calibration
 from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Bool, Double, Long
 from usdbrdf.shading.outside_light import Asked
-from usdbrdf.transport.environment import Sun
+from usdbrdf.transport.environment import SUN_HALF_ANGLE, Sun
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import lift_from_surface
+from usdbrdf.transport.sunlight import sunlit
 from usdbrdf.transport.warps import axes_across
 
 # Directions of the first search; how many of them are followed; how much finer each of the next
@@ -24,6 +26,15 @@ from usdbrdf.transport.warps import axes_across
 _DIRECTIONS, _FOLLOWED, _FINER, _REFINED = 3000, 16, 2.5, 6
 _STRENGTHS = np.geomspace(0.25, 128, 10)
 _NEAR = 0.3  # radians in which the sun is looked for again
+# Around a direction: steps in radians, of each so many moves at most; what its strength may be, in
+# units of what was thought of it; half angles of its disc; and the deviation, in texels, by which
+# pixels blur the edges of shadows.
+_STEPS, _MOST_MOVES = np.radians([0.6, 0.3, 0.15, 0.07]), 6
+_OTHERWISE = np.geomspace(0.4, 5.0, 16)
+_HALF_ANGLES = SUN_HALF_ANGLE * 1.5 ** np.arange(6)
+_BLUR = 0.7
+# Standard errors by which one direction, or width, of many must explain more than what was thought.
+_SURE = 4.0
 _OUTLIER = calibration.number("outside.outlier")
 
 
@@ -74,6 +85,64 @@ def find_sun(
         kept = around[np.arange(len(kept)), best][order][: max(1, len(kept) // 2)]
         reach /= _FINER
     return Sun(kept[0], np.full(3, level))
+
+
+def with_disc(surface: TexturedScene, asked: Asked, irradiance: Double, sun: Sun, seed: int) -> Sun:
+    """The ``sun``, about where and as strong as it is thought to be, where the half-shadows show
+    it: its direction, to a fraction of its disc, and the width of that. irradiance (N, 3) without
+    it."""
+    some = np.arange(0, len(asked.texel), 2)
+    asked, irradiance = asked.of(some), irradiance[some]
+    reflected, without = np.log(asked.reflected.max(axis=1)), irradiance.mean(axis=1)
+    first = np.searchsorted(asked.segment, np.arange(asked.segment.max() + 2))
+    strengths = float(sun.irradiance.mean()) * _OTHERWISE
+
+    def costs(sun: Sun) -> Double:
+        """(N,) of each texel, with the best strength."""
+        share = _blurred_sunlight(surface, asked.texel, sun, seed)
+        return _costs_of_texels(reflected, without, share, asked.clipped, first, strengths)
+
+    def best_of(suns: list[Sun]) -> tuple[Double, Sun]:
+        with ThreadPoolExecutor(2) as pool:
+            found = list(pool.map(costs, suns))
+        best = min(range(len(suns)), key=lambda k: float(found[k].mean()))
+        return found[best], suns[best]
+
+    at_first = now = costs(sun), sun
+    for step in _STEPS:
+        for _ in range(_MOST_MOVES):
+            beside = _beside(now[1].direction, step)
+            moved = best_of([sun._replace(direction=direction) for direction in beside])
+            if moved[0].mean() >= now[0].mean():
+                break
+            now = moved
+    now = now if _is_better(now[0], at_first[0]) else at_first
+    wider = best_of([now[1]._replace(half_angle=float(angle)) for angle in _HALF_ANGLES])
+    return wider[1] if _is_better(wider[0], now[0]) else now[1]
+
+
+def _is_better(costs: Double, before: Double) -> bool:
+    """Is the mean of ``costs`` (N,) less, by more than these scatter?"""
+    gain = before - costs
+    return bool(gain.mean() > _SURE * gain.std() / np.sqrt(len(gain)))
+
+
+def _beside(direction: Double, step: float) -> Double:
+    """(8, 3) unit directions around one."""
+    right, up = axes_across(direction)
+    beside = [direction + step * (x * right + y * up) for x, y in product((-1, 0, 1), repeat=2)]
+    return np.stack([d / np.linalg.norm(d) for i, d in enumerate(beside) if i != 4])
+
+
+def _blurred_sunlight(surface: TexturedScene, index: Long, sun: Sun, seed: int) -> Double:
+    """(N,) ``sunlit`` of texels ``index`` as pixels show it."""
+    total, weights = np.zeros(len(index)), np.zeros(len(index))
+    for right, down in product((-1, 0, 1), repeat=2):
+        beside, there = surface.texels.beside_on_surface(index, right, down)
+        weight = there * np.exp(-0.5 * (right**2 + down**2) / _BLUR**2)
+        total += weight * sunlit(surface, beside, sun, seed)
+        weights += weight
+    return np.asarray(total / weights)
 
 
 def _spread(count: int) -> Double:
@@ -127,6 +196,23 @@ def _costs(
                 if total / points >= best[m]:  # it only grows
                     break
             best[m] = min(best[m], total / points)
+    return best
+
+
+@loop
+def _costs_of_texels(
+    reflected: Double, without: Double, share: Double, clipped: Bool, first: Long, strengths: Double
+) -> Double:
+    """(N,) as of ``_costs``, what each texel adds with the best strength."""
+    best, least = np.empty(len(share)), np.inf
+    rest, cost = np.empty(len(share)), np.empty(len(share))
+    for strength in strengths:
+        rest[:] = reflected - np.log(without + strength * share)
+        for k in range(len(first) - 1):
+            low, high = first[k], first[k + 1]
+            _cost_of_each(rest[low:high], clipped[low:high], cost[low:high])
+        if cost.mean() < least:
+            least, best[:] = cost.mean(), cost
     return best
 
 
