@@ -212,7 +212,7 @@ def light_from_outside(
         told = _beside_mirrored(look, told)
     error = jackknife(*told.with_sun, told.found)
     sun_shines = _sun_shines(told, error)
-    told, error = _in_shadows(look, told) if sun_shines else _sunless(look, told)
+    told, error = _in_shadows(look, told, error) if sun_shines else _sunless(look, told)
     found = levelled(*told.with_sun, told.found)
     sky, of_sky = np.exp(found.log_radiance[: len(look.used)]), error[: len(look.used)].max(axis=1)
     # By the light that each brings: nobody asks how dark dark ground is.
@@ -383,7 +383,7 @@ def _sunless(look: _Look, told: _Told) -> tuple[_Told, Double]:
     return told, jackknife(*without_sun, found)
 
 
-def _in_shadows(look: _Look, told: _Told) -> tuple[_Told, Double]:
+def _in_shadows(look: _Look, told: _Told, error: Double) -> tuple[_Told, Double]:
     """The same with the sun's disc as half-shadows show it, and as strong as it is told best where
     shadows are blurred; and the errors, (K, 3).
 
@@ -391,13 +391,15 @@ def _in_shadows(look: _Look, told: _Told) -> tuple[_Told, Double]:
     shadows passes for light from all around the sun, and what is too dark between them for a weak
     one. Two ways around that: texels that lie clear of shadows' edges, where there are such; and
     means over more than a pixel, which are those of what falls there, whatever it mixes."""
+    before = told
     for _ in range(_LOOKS_AT_DISC):
         sun = told.sun._replace(irradiance=np.exp(told.found.log_radiance[-1]))
         found = with_disc(look.surface, told.asked, told.light(), sun, look.seed)
         if found is sun:
             break
         told = _solved(look, told.asked, told.sources, found)
-    error = jackknife(*told.with_sun, told.found)
+    if told is not before:
+        error = jackknife(*told.with_sun, told.found)
     ways = [_clear_of_shadows(look, told, error), _as_pixels_mix(look, told)]
     well = [way for way in ways if way and way[1][-1].max() < _MOST_CLEAR_ERROR]
     return min(well, key=lambda way: float(way[1][-1].max()), default=(told, error))
