@@ -7,6 +7,8 @@ import errno
 import fcntl
 import hashlib
 import os
+import resource
+import shutil
 import socket
 import stat
 import subprocess
@@ -28,6 +30,7 @@ from usdbrdf.files.atomic import (
     whole_folder,
     write_text_atomic,
 )
+from usdbrdf.files.scratch import PREFIX
 
 ROOT = Path(__file__).parents[2]
 
@@ -325,3 +328,21 @@ def test_an_error_does_not_name_what_is_temporary(tmp_path):
     theirs = tmp_path / ".tmp-theirs" / "a"
     with pytest.raises(EnvironmentFailure, match=str(theirs)), environment_failures("x"):
         theirs.read_text()
+
+
+def test_a_copy_that_does_not_fit_names_its_place_and_the_limit(tmp_path):
+    source, scratch = tmp_path / "sound.usda", tmp_path / f"{PREFIX}abc" / "sound.usda"
+    scratch.parent.mkdir()
+    source.write_bytes(bytes(5000))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with (
+            pytest.raises(
+                EnvironmentFailure, match=rf"^x: File too large \('{tmp_path}'\)\. .*ulimit"
+            ),
+            environment_failures("x"),
+        ):
+            shutil.copyfile(source, scratch)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
