@@ -20,6 +20,7 @@ from pathlib import Path
 
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files.scratch import PREFIX as SCRATCH_PREFIX
+from usdbrdf.files.scratch import told_as
 
 TEMPORARY_PREFIX = ".tmp-"
 _BLOCK = 1 << 20  # bytes hashed at a time
@@ -130,7 +131,8 @@ def temporary_beside(path: Path) -> Iterator[Path]:
     with _new_name() as name, _at_work_in(path.parent):
         staged = path.with_name(f"{name}{path.suffix}")
         try:
-            yield staged
+            with told_as(path.with_name(name), path):
+                yield staged
         finally:
             with suppress(OSError):
                 staged.unlink()
@@ -145,7 +147,8 @@ def temporary_folder(final: Path) -> Iterator[Path]:
         staged = final.with_name(name)
         staged.mkdir()
         try:
-            yield staged
+            with told_as(staged, final):
+                yield staged
         finally:
             shutil.rmtree(staged, ignore_errors=True)
 

@@ -148,18 +148,17 @@ def author_inputs(prim: Sdf.PrimSpec, type_name: Sdf.ValueTypeName, **values: An
         attribute(prim, f"inputs:{name}", type_name, value)
 
 
-def export(layer: Sdf.Layer, path: Path, *, folder: Path, output: Path | None = None) -> None:
+def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
     """Write ``layer`` to ``path``, in the format of its suffix, checked before it gets the name.
 
     folder   where the layer will lie once published; its relative paths are judged from there
-    output   what a failure is told of, where ``path`` is gone when somebody reads that
 
     When the disk is full USD leaves a truncated file in place of the old one: hence a name beside.
     """
     with temporary_beside(path) as written:
         failure = EnvironmentFailure(
-            f"{output or path}: the USD layer could not be written completely. Free disk space or "
-            "correct the permission, then run the same command again. [environment.io]"
+            f"{path}: the USD layer could not be written completely. Free disk space or correct "
+            "the permission, then run the same command again. [environment.io]"
         )
         try:
             done = layer.Export(str(written))
