@@ -40,6 +40,10 @@ class ImageRefused(InputRefused):
     path: Path | None = None
 
 
+class MeshMissing(InputRefused):
+    """No mesh lies where one is to be, or several do."""
+
+
 class CrashedChild(InputRefused):
     """A child process died of a signal while it worked on the input."""
 

@@ -30,6 +30,7 @@ def table(steps: Mapping[str, Mapping[str, Any]], root: Path) -> list[str]:
         return []
     statuses = statuses_of(steps)
     rows = [("objects", f"{len(statuses)}: {', '.join(_counted(statuses))}")]
+    rows += [("lamps", line) for line in _of_lamps(steps["shade"])]
     rows += [("a look", line) for line in _worth_a_look(steps["fit"]["objects"], statuses)]
     rows += [("surface", line) for line in _of_surface(steps["texture"])]
     doubts = sum(len(step.get("warnings", ())) for step in steps.values())
@@ -49,7 +50,8 @@ def table(steps: Mapping[str, Mapping[str, Any]], root: Path) -> list[str]:
 
 def statuses_of(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """Of each object; a lamp's is that it shines, a pane's that a person said so."""
-    lamps = {name for part in _parts(steps["shade"]) for name in part.get("emitters", ())}
+    parts = _parts(steps["shade"]).values()
+    lamps = {name for part in parts for name in part.get("emitters", ())}
     return {
         name: "lamp"
         if name in lamps
@@ -60,9 +62,17 @@ def statuses_of(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     }
 
 
-def _parts(step: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-    """The summary of a step, or those of its lightings."""
-    return [*step["lightings"].values()] if "lightings" in step else [step]
+def _parts(step: Mapping[str, Any]) -> Mapping[str, Mapping[str, Any]]:
+    """The summaries of a step by its lightings, that of the only one by ""."""
+    parts: Mapping[str, Mapping[str, Any]] = step.get("lightings", {"": step})
+    return parts
+
+
+def _of_lamps(shade: Mapping[str, Any]) -> Iterator[str]:
+    """How many shine in each of several lightings: an object is a lamp that shines in any."""
+    for lighting, part in _parts(shade).items():
+        if lighting:
+            yield f"{len(part.get('emitters', ()))} in {lighting}"
 
 
 def _counted(statuses: Mapping[str, str]) -> Iterator[str]:
@@ -106,7 +116,8 @@ def _known(found: Mapping[str, Any]) -> str:
 
 
 def _of_surface(texture: Mapping[str, Any]) -> Iterator[str]:
-    for part in _parts(texture):
+    for lighting, part in _parts(texture).items():
         clipped = part["clipped_fraction"]
         text = f"{part['measured_fraction']:.0%} of the texels measured"
+        text += f" in {lighting}" if lighting else ""
         yield text + (f", {clipped:.1%} clipped in every frame" if clipped >= 0.0005 else "")

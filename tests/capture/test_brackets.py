@@ -305,6 +305,31 @@ def test_a_photograph_whose_name_is_not_utf8_is_refused_with_that_reason(tmp_pat
         merge_brackets(folder, tmp_path / "merged")
 
 
+@pytest.mark.fault("I13")
+@pytest.mark.parametrize("command", ["merge-brackets", "develop-raw", "develop-video"])
+def test_a_photograph_is_no_capture(tmp_path, command, capsys):
+    photograph = tmp_path / "stack" / "IMG_0.png"
+    photograph.parent.mkdir()
+    photograph.write_bytes(b"\x89PNG")
+    assert main([command, str(photograph), "-o", str(tmp_path / "merged")]) == 3
+    said = capsys.readouterr().err
+    assert "IMG_0.png: neither a folder nor a transforms.json. Name the folder" in said
+
+
+@pytest.mark.fault("I13")
+@pytest.mark.parametrize("name", ["mesh.ply", "objects.json", "mask.png"])
+def test_a_pipe_beside_the_brackets_is_refused_before_they_are_merged(tmp_path, name, capsys):
+    folder = tmp_path / "scan"
+    _bracketed(folder, same_poses=False)
+    (folder / name).unlink(missing_ok=True)
+    os.mkfifo(folder / name)
+    with edited(folder / "transforms.json") as document:
+        document["frames"][0]["mask_path"] = "mask.png"
+    assert main(["merge-brackets", str(folder), "-o", str(tmp_path / "merged"), "-q"]) == 3
+    assert f"{folder / name}: not a regular file" in capsys.readouterr().err
+    assert not (tmp_path / "merged").exists()
+
+
 def test_a_capture_that_is_not_there_is_told_whatever_lies_beside_it(tmp_path, capsys):
     gone, beside = tmp_path / "gone", tmp_path / "merged"
     assert main(["merge-brackets", str(gone), "-o", str(beside)]) == 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from pathlib import Path
 
@@ -531,3 +532,21 @@ def test_text_that_is_not_utf_8_ends_in_a_sentence(tmp_path):
         (tmp_path / f"{i}.usda").write_bytes(text)
         with pytest.raises(InputRefused, match=r"\.usda: .*\[(stage\.\w+|mesh\.empty)\]$"):
             meshes_from_usd(tmp_path / f"{i}.usda")
+
+
+@pytest.mark.fault("I13")
+@pytest.mark.parametrize(
+    ("layer", "prim"),
+    [
+        ("subLayers = [@./pipe.usda@]", ""),
+        ("", "references = @./pipe.usda@"),
+        ("", "clips = { dictionary default = { asset[] assetPaths = [@./pipe.usda@] } }"),
+    ],
+)
+def test_a_pipe_that_a_stage_names_is_not_waited_for(tmp_path, layer, prim):
+    os.mkfifo(tmp_path / "pipe.usda")
+    metadata = f'defaultPrim = "a"\n    metersPerUnit = 1\n    {layer}'
+    text = f'#usda 1.0\n(\n    {metadata}\n)\ndef Xform "a" (\n    {prim}\n)\n{{\n}}\n'
+    (tmp_path / "a.usda").write_text(text)
+    with pytest.raises(InputRefused, match=r"pipe.usda: not a regular file.*\[stage.file\]$"):
+        meshes_from_usd(tmp_path / "a.usda")

@@ -217,3 +217,9 @@ def test_other_units_are_refused(pair):
     scans["by_night"] = replace(scans["by_night"], meters_per_unit=0.01)
     with pytest.raises(InputRefused, match=r"\[lighting.units\]"):
         refuse_other_scenes(scans)
+
+
+def test_the_share_of_rays_that_hit_is_no_sum(pair):
+    scans = _scans(*(made.folder for made in pair))
+    shares = [scan.counts["rays_hit_percent"] for scan in scans.values()]
+    assert scan_of_lightings(scans, CREASE).counts["rays_hit_percent"] == min(shares)

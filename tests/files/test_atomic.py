@@ -7,6 +7,8 @@ import errno
 import fcntl
 import hashlib
 import os
+import resource
+import shutil
 import socket
 import stat
 import subprocess
@@ -28,6 +30,7 @@ from usdbrdf.files.atomic import (
     whole_folder,
     write_text_atomic,
 )
+from usdbrdf.files.scratch import PREFIX, scratch_folder
 
 ROOT = Path(__file__).parents[2]
 
@@ -325,3 +328,34 @@ def test_an_error_does_not_name_what_is_temporary(tmp_path):
     theirs = tmp_path / ".tmp-theirs" / "a"
     with pytest.raises(EnvironmentFailure, match=str(theirs)), environment_failures("x"):
         theirs.read_text()
+
+
+def test_a_refusal_names_what_was_to_become_of_something_temporary(tmp_path):
+    output = tmp_path / "room.usdz"
+    with (
+        pytest.raises(EnvironmentFailure) as refused,
+        scratch_folder(output) as scratch,
+        temporary_folder(scratch / "textures") as folder,
+        temporary_beside(folder / "a.exr") as staged,
+    ):
+        raise EnvironmentFailure(f"{staged}: no ({staged.with_suffix('.dd3.temp.exr')}). Free it.")
+    place = f"{output}/textures/a.exr"
+    assert str(refused.value) == f"{place}: no ({place}). Free it."
+
+
+def test_a_copy_that_does_not_fit_names_its_place_and_the_limit(tmp_path):
+    source, scratch = tmp_path / "sound.usda", tmp_path / f"{PREFIX}abc" / "sound.usda"
+    scratch.parent.mkdir()
+    source.write_bytes(bytes(5000))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with (
+            pytest.raises(
+                EnvironmentFailure, match=rf"^x: File too large \('{tmp_path}'\)\. .*ulimit"
+            ),
+            environment_failures("x"),
+        ):
+            shutil.copyfile(source, scratch)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)

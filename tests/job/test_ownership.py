@@ -129,6 +129,12 @@ for name in ("room", "above/room"):
         shutil.rmtree(folder)
 
 
+def test_an_unwritable_folder_is_named_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(EnvironmentFailure, match=rf"^{tmp_path}: not writable\. Change"):
+        own(tmp_path)
+
+
 def test_unwritable_parent_as_the_system_reports_it(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(EnvironmentFailure, match=r"not writable.+\[environment.output\]"):

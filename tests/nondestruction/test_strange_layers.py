@@ -103,6 +103,28 @@ def test_a_pipe_among_the_layers_is_not_waited_for(
 
 
 @pytest.mark.fault("I13")
+@pytest.mark.parametrize("template", [False, True])
+def test_a_pipe_among_value_clips_is_not_waited_for(converted, strange, tmp_path, capfd, template):
+    pipe = strange.parent / "clips" / "c.1.usda"
+    pipe.parent.mkdir()
+    os.mkfifo(pipe)
+    where = (
+        'string templateAssetPath = "../clips/c.#.usda"\ndouble templateStartTime = 1\n'
+        "double templateEndTime = 1\ndouble templateStride = 1\n"
+        if template
+        else "asset[] assetPaths = [@../clips/c.1.usda@]\ndouble2[] active = [(0, 0)]\n"
+    )
+    clips = f'clips = {{\ndictionary default = {{\n{where}string primPath = "/room"\n}}\n}}'
+    (strange / "edits.usda").write_text(f'#usda 1.0\nover "room" (\n{clips}\n)\n{{\n}}\n')
+    try:
+        assert main(calls(strange, converted.folder, tmp_path)["validate"]) == 3
+    finally:
+        pipe.unlink()
+        pipe.parent.rmdir()
+    assert f"{pipe}: this is no regular file" in capfd.readouterr().err
+
+
+@pytest.mark.fault("I13")
 @pytest.mark.parametrize("name", ["package", "validate"])
 def test_a_pipe_that_the_edits_name_elsewhere_is_not_waited_for(
     converted, strange, tmp_path, capfd, name

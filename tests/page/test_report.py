@@ -334,6 +334,10 @@ def test_a_copy_without_its_photographs_is_told_what_it_lacks(room, tmp_path):
     ) as no:
         report(copy, tmp_path / "page.html")
     assert "[report.photographs]" in str(no.value)
+    # Which a version that was published without them has not.
+    (copy / "layers/photographs.usdc").unlink()
+    with pytest.raises(InputRefused, match=r"room: it has no layers/photographs\.usdc"):
+        report(copy, tmp_path / "page.html")
 
 
 def test_texels_that_mirror_daylight_are_no_lamp(room):

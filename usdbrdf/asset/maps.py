@@ -20,6 +20,7 @@ from usdbrdf.asset.properties import Aov
 from usdbrdf.asset.readers.scene import (
     aov_path,
     frames_from_stage,
+    hashes_of_photographs,
     light_from_outside,
     lighting_of_stage,
     read_shading,
@@ -140,6 +141,12 @@ class AssetMaps:
     def all_frames(self) -> Frames:
         """Those of all lightings."""
         return frames_from_stage(self.stage)
+
+    @cached_property
+    def hashes_of_frames(self) -> list[str]:
+        """What ``hashes_of_photographs`` tells of the photographs of ``frames``."""
+        found = hashes_of_photographs(self.stage)
+        return [found[i] for i in self.own_frames]
 
     @property
     def lighting(self) -> str:

@@ -188,6 +188,10 @@ class Photographs:
     lighting: Annotated[Sequence[str], Fact(CAPTURE, "lighting", "string", "", """Which lighting of
         the scene the photograph shows, a variant of the set lighting; empty where there is but
         one.""", samples="changes", when=lambda taken: any(taken.lighting))]
+    sha256: Annotated[Sequence[str], Fact(CAPTURE, "sha256", "string", "", """The SHA-256 of the
+        photograph as ingest read it, and after a space that of its mask, if it has one; steps take
+        no other. Said by photographs.usdc.""", samples="every",
+        when=lambda taken: any(taken.sha256))]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -63,12 +63,13 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
     The unit is the same for all frames and has no other meaning: radiometric up to one scale.
     Raises InputRefused for what makes no brackets.
     """
-    source = capture / "transforms.json" if capture.is_dir() else capture
+    source = document_named(capture)
     if capture.is_dir() and not source.is_file():
         document: Any = _document_of_folder(capture)
     else:
         document = read_json(source, nonfinite_below=("transform_matrix",))
     brackets = _brackets(source, document)
+    beside = files_beside(source, document)
     encoding = _linear_space(source, document, brackets[0].images[0])
     telling = [brackets[i] for i in spread_evenly(len(brackets), _TELLING)]
     response = response_from_brackets(
@@ -90,7 +91,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
             flickers.extend(made.flicker)
             if made.unchecked:
                 unchecked[name] = made.unchecked
-        copy_beside(source, document, staged)
+        copy_beside(beside, staged)
         rest = {**document, "frames": frames, "encoding": encoding}
         write_json(staged / "transforms.json", rest)
     photographs = sum(len(bracket.images) for bracket in brackets)
@@ -126,17 +127,38 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
     }
 
 
-def copy_beside(source: Path, document: Any, folder: Path) -> None:
-    """Copy the mesh, the objects and the masks that a transforms.json has beside it into another
-    folder."""
+def document_named(capture: Path) -> Path:
+    """The transforms.json that a command is to work on: in a folder, or itself."""
+    if capture.is_file() and capture.suffix.lower() != ".json":
+        raise InputRefused(
+            f"{capture}: neither a folder nor a transforms.json. Name the folder that it lies in. "
+            "[capture.format]"
+        )
+    return capture / "transforms.json" if capture.is_dir() else capture
+
+
+def files_beside(source: Path, document: Any) -> dict[str, Path]:
+    """The mesh, the objects and the masks that a transforms.json has beside it, by the names that
+    it gives them; InputRefused where what is there is no file: a pipe would be waited for."""
     masks = {str(f["mask_path"]) for f in document["frames"] if f.get("mask_path") is not None}
     usual = (("mesh", "mesh.ply"), ("objects", "objects.json"))
-    for name in (*(str(document.get(key, own)) for key, own in usual), *sorted(masks)):
-        beside = contained(source.parent, name)
-        if beside.is_file():
-            place = contained(folder, name)
-            place.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(beside, place)
+    names = (*(str(document.get(key, own)) for key, own in usual), *sorted(masks))
+    found = {name: contained(source.parent, name) for name in names}
+    for place in found.values():
+        if place.exists() and not place.is_file():
+            raise InputRefused(
+                f"{place}: not a regular file. Put the file there that {source.name} means, or "
+                "take its entry out. [capture.file]"
+            )
+    return {name: file for name, file in found.items() if file.is_file()}
+
+
+def copy_beside(beside: Mapping[str, Path], folder: Path) -> None:
+    """Copy ``files_beside`` into another folder, under the same names."""
+    for name, file in beside.items():
+        place = contained(folder, name)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, place)
 
 
 class _Made(NamedTuple):

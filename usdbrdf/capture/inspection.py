@@ -20,7 +20,7 @@ import numpy as np
 from usdbrdf.capture.adapters import choose_adapter, read_with, refuse_missing
 from usdbrdf.capture.checks import DroppedFrame, Findings, spread_evenly
 from usdbrdf.capture.native import own_faces
-from usdbrdf.errors import ImageRefused, UsageError, UsdBrdfError
+from usdbrdf.errors import ImageRefused, MeshMissing, UsageError, UsdBrdfError
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Float
@@ -106,7 +106,7 @@ class Inspection:
                 lacks.append("noise_floor_radiance: noise passes for radiance")
             if not self.frames.radiometric:
                 lacks.append("radiance: 8-bit frames give colours and relative brightness only")
-        if any("[mesh.missing]" in str(error) for error in self.refusals):
+        if any(isinstance(error, MeshMissing) for error in self.refusals):
             lacks.append("mesh")
         if any("[objects.none]" in warning for warning in self.warnings):
             lacks.append("object labels: connected parts are the objects")

@@ -94,6 +94,9 @@ def scan_of_lightings(scans: Mapping[str, Scan], crease_angle_deg: float) -> Sca
     counts = Counter[str]()
     for scan in scans.values():
         counts.update(scan.counts)
+    # Shares do not add up: of these the one that is to be looked at.
+    for name in (name for name in counts if name.endswith("_percent")):
+        counts[name] = min(s.counts[name] for s in scans.values() if name in s.counts)
     return replace(
         first,
         mesh=turned_towards_cameras(mesh, sides, first.has_normals, crease_angle_deg),

@@ -30,7 +30,7 @@ from usdbrdf.capture.checks import (
 )
 from usdbrdf.capture.develop import frames_of_photographs
 from usdbrdf.capture.rigid_poses import rigid_records
-from usdbrdf.errors import ImageRefused, InputRefused, UsageError, UsdBrdfError
+from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing, UsageError, UsdBrdfError
 from usdbrdf.files.colour import kind_of_encoding, known_encodings, unknown_encoding
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
@@ -206,7 +206,7 @@ def geometry_from_usd(
             "in the program it comes from, or give a PLY. [usage.option]"
         )
     if not path.is_file():
-        raise InputRefused(
+        raise MeshMissing(
             f"{path}: this mesh does not exist. Name the mesh with --mesh. [mesh.missing]"
         )
     allow = (capture_root, *options.allow_outside)

@@ -17,7 +17,14 @@ from typing import Any
 import numpy as np
 
 from usdbrdf import calibration
-from usdbrdf.capture.bracketed import copy_beside, exposure_of, frame_of, frames_of_document
+from usdbrdf.capture.bracketed import (
+    copy_beside,
+    document_named,
+    exposure_of,
+    files_beside,
+    frame_of,
+    frames_of_document,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.documents import read_json, write_json
@@ -35,11 +42,12 @@ _DRIFT = calibration.number("raw.drift")
 def develop_raw(capture: Path, folder: Path) -> dict[str, Any]:
     """Write the capture with an EXR of radiance for each raw file into the new ``folder``, and say
     what was found. Raises InputRefused for what is no capture of raw files."""
-    source = capture / "transforms.json" if capture.is_dir() else capture
+    source = document_named(capture)
     document = read_json(source, nonfinite_below=("transform_matrix",))
     entries = frames_of_document(source, document)
     if not entries:
         raise InputRefused(f"{source}: names no frames. Name the raw files as such. [raw.none]")
+    beside = files_beside(source, document)
     files = [_raw_file(source, entry) for entry in entries]
     shown = progress(files, total=len(files), label="white balance", unit="frames")
     # Of each file twice, as all of them do not fit into memory.
@@ -63,7 +71,7 @@ def develop_raw(capture: Path, folder: Path) -> dict[str, Any]:
             kept = {k: v for k, v in entries[i].items() if k != "noise_floor_radiance"}
             stated = {"exposure_time": float(exposures[i]), "saturation_radiance": saturation}
             frames.append({**kept, "file_path": name, **stated})
-        copy_beside(source, document, staged)
+        copy_beside(beside, staged)
         write_json(
             staged / "transforms.json",
             {**document, "frames": frames, "encoding": "lin_rec709_scene"},

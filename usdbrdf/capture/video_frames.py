@@ -18,7 +18,13 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.capture.alignment import aligned
-from usdbrdf.capture.bracketed import copy_beside, frames_of_document, is_exposure
+from usdbrdf.capture.bracketed import (
+    copy_beside,
+    document_named,
+    files_beside,
+    frames_of_document,
+    is_exposure,
+)
 from usdbrdf.capture.brackets import BRIGHT_CODE, DARK_CODE, Response, merge, response_from_brackets
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused
@@ -64,9 +70,9 @@ def develop_video(capture: Path, folder: Path) -> dict[str, Any]:
     Raises InputRefused for what is no capture of a video, and where the exposures are not those
     that its pixels show.
     """
-    source = capture / "transforms.json" if capture.is_dir() else capture
+    source = document_named(capture)
     document = read_json(source, nonfinite_below=("transform_matrix",))
-    video = _video(source, document)
+    video, beside = _video(source, document), files_beside(source, document)
     path = contained(source.parent, str(document["video"]))
     with scratch_folder() as scratch:
         wanted = {n + step for n in video.numbers for step in (-1, 0, 1)} | {
@@ -99,7 +105,7 @@ def develop_video(capture: Path, folder: Path) -> dict[str, Any]:
                     "noise_floor_radiance": made.noise_floor,
                 }
                 frames.append({**kept, "file_path": name, "exposure_time": exposure, **limits})
-            copy_beside(source, document, staged)
+            copy_beside(beside, staged)
             of_video = ("video", "exposure_cycle", "exposure_table")
             rest = {k: v for k, v in document.items() if k not in of_video}
             rest |= {"frames": frames, "encoding": "lin_rec709_scene"}

@@ -55,7 +55,7 @@ from usdbrdf.errors import (
     UsageError,
     UsdBrdfError,
 )
-from usdbrdf.files.atomic import environment_failures, folder_of, publish, temporary_beside
+from usdbrdf.files.atomic import environment_failures, folders_above, publish, temporary_beside
 from usdbrdf.files.colour import WORKING_SPACE
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
@@ -283,7 +283,7 @@ def write_package(
     glb = output.suffix.lower() == GLB
     stage = stage_in_look(asset, options.look)
     flat = flattened(stage, asset, with_lights=not glb and options.profile != ARKIT)
-    with environment_failures(str(output)), folder_of(output), scratch_folder() as made:
+    with environment_failures(str(output)), folders_above(output), scratch_folder(output) as made:
         reduced: dict[str, int] = {}
         if options.low_poly is not None:
             count = make_low_poly(flat, asset, made, options.low_poly, warn)
@@ -315,8 +315,8 @@ def _write_whole(output: Path, asset: Asset, options: PackageOptions) -> dict[st
     def describe(layer: Sdf.Layer) -> None:
         layer.documentation = "A packed asset: all its looks and lightings are variants."
 
-    with environment_failures(str(output)), folder_of(output):
-        with scratch_folder() as folder:
+    with environment_failures(str(output)), folders_above(output):
+        with scratch_folder(output) as folder:
             found = write_copy(
                 asset,
                 folder,
@@ -356,7 +356,7 @@ def _write_usdz(
     if space != WORKING_SPACE:
         colours.look_at(flat, space)
         convert_layer(flat.GetRootLayer(), colours, space)
-    with scratch_folder() as folder:
+    with scratch_folder(output) as folder:
         textures: dict[tuple[Any, ...], NewTexture] = {}
         packed: set[str] = set()
         for use in texture_uses(flat, asset, made):

@@ -26,7 +26,7 @@ from usdbrdf.farm.scans import RESULTS_FOLDER, SCANS_FILE, ScanList, list_docume
 from usdbrdf.files.atomic import (
     environment_failures,
     flush_folder,
-    folder_of,
+    folders_above,
     is_bare,
     move,
     temporary_folder,
@@ -124,7 +124,7 @@ def write_bundle(folder: Path, scans: ScanList, bundle: Bundle) -> None:
             REFERENCES: bundle.references,
             TEMPLATE: bundle.template,
         }
-        with folder_of(folder / TEMPLATE), temporary_folder(folder / TEMPLATE) as staged:
+        with folders_above(folder / TEMPLATE), temporary_folder(folder / TEMPLATE) as staged:
             for name, document in documents.items():
                 write_json(staged / name, document)
             changed = [name for name in documents if not _are_same(staged / name, folder / name)]

@@ -19,6 +19,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.scratch import PREFIX as SCRATCH_PREFIX
+from usdbrdf.files.scratch import told_as
 
 TEMPORARY_PREFIX = ".tmp-"
 _BLOCK = 1 << 20  # bytes hashed at a time
@@ -27,11 +29,22 @@ _MACHINE = hashlib.sha256(socket.gethostname().encode("utf-8", "replace")).hexdi
 _TEMPORARY = re.compile(
     rf"(?P<name>{re.escape(TEMPORARY_PREFIX)}{_MACHINE}-(?P<process>[1-9]\d*)-[0-9a-f]{{8}})(\..*)?"
 )
+_TEMPORARY_PLACE = re.compile(
+    rf"{re.escape(TEMPORARY_PREFIX)}{_MACHINE}-|{re.escape(SCRATCH_PREFIX)}"
+)
 # Of these calls may fail that ask for nothing but what is right.
 _OF_THE_MACHINE = {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE,
     errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM, errno.ETIMEDOUT,
 }  # fmt: skip
+# What helps against some of them, where it is neither space nor permission.
+_CURES = {
+    errno.EFBIG: "Raise this shell's limit on the size of files (ulimit -f), or that of the disk",
+    errno.EMFILE: "Raise this shell's limit on open files (ulimit -n)",
+    errno.ENFILE: "Close other programs, which hold all files that this machine can open",
+}
+# Of a copy, these are about what it was to become.
+_OF_THE_COPY = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _own: set[str] = set()  # names in use by this process, its threads, and those it was forked from
 _swept: set[Path] = set()  # once in a process is enough
 
@@ -79,7 +92,7 @@ def make_folders(folder: Path) -> None:
 
 
 @contextmanager
-def folder_of(file: Path) -> Iterator[None]:
+def folders_above(file: Path) -> Iterator[None]:
     """Make the folders above a file; those that hold nothing at the end go again."""
     made = [folder for folder in file.parents if not folder.exists()]
     try:
@@ -118,7 +131,8 @@ def temporary_beside(path: Path) -> Iterator[Path]:
     with _new_name() as name, _at_work_in(path.parent):
         staged = path.with_name(f"{name}{path.suffix}")
         try:
-            yield staged
+            with told_as(path.with_name(name), path):
+                yield staged
         finally:
             with suppress(OSError):
                 staged.unlink()
@@ -133,7 +147,8 @@ def temporary_folder(final: Path) -> Iterator[Path]:
         staged = final.with_name(name)
         staged.mkdir()
         try:
-            yield staged
+            with told_as(staged, final):
+                yield staged
         finally:
             shutil.rmtree(staged, ignore_errors=True)
 
@@ -245,9 +260,10 @@ def _failure(subject: str, error: MemoryError | OSError) -> EnvironmentFailure:
         )
     place = _place_of(error)
     where = f" ({place!r})" if place and str(place) != subject else ""
+    cure = _CURES.get(error.errno or 0, "Free disk space or correct the permission")
     return EnvironmentFailure(
-        f"{subject}: {error.strerror or error}{where}. Free disk space or correct the "
-        "permission, then run the same command again; finished work is kept. [environment.io]"
+        f"{subject}: {error.strerror or error}{where}. {cure}, then run the same command again; "
+        "finished work is kept. [environment.io]"
     )
 
 
@@ -262,11 +278,13 @@ def failure_of_machine(error: Exception) -> EnvironmentFailure | None:
 def _place_of(error: OSError) -> object:
     """Which file an error is about; of one that is temporary, and gone when the message is read,
     what it was to become, or else the folder that it was in."""
-    ours = f"{TEMPORARY_PREFIX}{_MACHINE}-"
-    places = [place for place in (error.filename, error.filename2) if isinstance(place, str)]
+    named = [error.filename, error.filename2]
+    if error.errno in _OF_THE_COPY:
+        named = [error.filename2 or error.filename]
+    places = [str(place) for place in named if isinstance(place, str | os.PathLike)]
     for place in places:
-        if ours not in place:
+        if not _TEMPORARY_PLACE.search(place):
             return place
     if not places:
         return error.filename
-    return places[0].partition(ours)[0].rstrip(os.sep) or os.curdir
+    return _TEMPORARY_PLACE.split(places[0])[0].rstrip(os.sep) or os.curdir

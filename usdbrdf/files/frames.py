@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from usdbrdf.ahead import ahead
+from usdbrdf.errors import ImageRefused
 from usdbrdf.files.colour import (
     WORKING_SPACE,
     kind_of_encoding,
@@ -101,8 +102,8 @@ class FramePixels:
 def read_frame(frames: Frames, i: int) -> FramePixels:
     """Read frame ``i``; ImageRefused where the file cannot be read whole.
 
-    Limits hold for the channels as they were recorded, so images are judged before their primaries
-    change.
+    So is one of another size than the frame's. Limits hold for the channels as they were recorded,
+    so images are judged before their primaries change.
     """
     saturation = float(frames.saturation_radiance[i])
     gain = 1.0 if frames.gain is None else float(frames.gain[i])
@@ -114,6 +115,15 @@ def read_frame(frames: Frames, i: int) -> FramePixels:
     dark = _in_any_channel(recorded < frames.noise_floor_radiance[i])
     space = linear_space_of(encoding)
     radiance = recorded if space == WORKING_SPACE else to_working_space(recorded, space)
+    width, height = frames.resolution[i].tolist()
+    # Compiled loops would read beyond the pixels that are there.
+    if width and radiance.shape[:2] != (height, width):
+        now = f"{radiance.shape[1]} x {radiance.shape[0]}"
+        raise ImageRefused(
+            f"{frames.image_paths[i]}: {now} pixels, and {width} x {height} when the capture was "
+            "read. Bring the file back, or run `usdbrdf convert` with the capture again. "
+            "[image.changed]"
+        )
     if any(frames.vignetting):
         radiance = radiance / transmission(frames, i)[..., None]
     return FramePixels(

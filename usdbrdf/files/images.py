@@ -21,7 +21,7 @@ import OpenImageIO as oiio
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
 from usdbrdf.files.channels import colours_of, layers_with_colours
-from usdbrdf.files.paths import why_unreadable
+from usdbrdf.files.paths import readable_size
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Bool, Byte, Float
 
@@ -333,9 +333,9 @@ def _opened(path: Path, max_side: int) -> Any:
             f"{path}: camera raw files are not read here (only their preview would be). Let "
             "`usdbrdf develop-raw` make a capture of radiance of them. [image.raw]"
         )
-    if (why := why_unreadable(path)) is not None:
-        raise ImageRefused(f"{path}: {why}. [image.unreadable]")
-    size = path.stat().st_size
+    size = readable_size(path)
+    if isinstance(size, str):
+        raise ImageRefused(f"{path}: {size}. [image.unreadable]")
     if size == 0:
         raise ImageRefused(f"{path}: the file is empty. Copy or export it again. [image.truncated]")
     # Without the hint, PNG's colours would come multiplied by their alpha.

@@ -76,8 +76,8 @@ def refuse_nameless(path: Path | None) -> None:
         ) from error
 
 
-def why_unreadable(image: Path) -> str | None:
-    """Why no library could open an image's file, and what to do; None where it may."""
+def readable_size(image: Path) -> int | str:
+    """Bytes of an image's file; or, where no library could open it, why, and what to do."""
     try:
         status = image.stat()
         str(image).encode()
@@ -88,7 +88,9 @@ def why_unreadable(image: Path) -> str | None:
         return f"cannot be read ({reason}). Check name and permission"
     if not stat.S_ISREG(status.st_mode):  # a FIFO would block for ever
         return "not a regular file. Name an image file"
-    return None if os.access(image, os.R_OK) else "permission denied. Make it readable"
+    if not os.access(image, os.R_OK):
+        return "permission denied. Make it readable"
+    return status.st_size
 
 
 def refuse_lost_folder() -> None:

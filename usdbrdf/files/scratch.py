@@ -6,13 +6,16 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import shutil
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import cache
 from pathlib import Path
+
+from usdbrdf.errors import UsdBrdfError
 
 PREFIX = "usdbrdf-scratch-"
 # Between its making and its locking a folder seems to have no owner.
@@ -20,8 +23,22 @@ _MIN_AGE_SECONDS = 60
 
 
 @contextmanager
-def scratch_folder() -> Iterator[Path]:
+def told_as(temporary: Path, final: Path) -> Iterator[None]:
+    """What is refused in here names ``final`` for what is temporary, which is gone when somebody
+    reads that; libraries put endings of their own behind its name."""
+    try:
+        yield
+    except UsdBrdfError as error:
+        name = rf"{re.escape(str(temporary))}(\.[\w.]*\w)?(?![\w-])"
+        error.args = (re.sub(name, lambda _: str(final), str(error)),)
+        raise
+
+
+@contextmanager
+def scratch_folder(output: Path | None = None) -> Iterator[Path]:
     """A new folder beside other temporary ones, of this user alone, gone at the end of the block.
+
+    output  what is made of it, which refusals are to name
 
     It is locked as long as this process lives, so that it can be told from what nobody owns.
     """
@@ -31,7 +48,8 @@ def scratch_folder() -> Iterator[Path]:
         try:
             with suppress(OSError):  # a file system without locks: it then has to be swept by hand
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield Path(name)
+            with told_as(Path(name), output) if output else nullcontext():
+                yield Path(name)
         finally:
             os.close(descriptor)
 

@@ -318,8 +318,9 @@ def _accepted(asset: Path, made: list[Path]) -> Path:
             "[environment.output]"
         )
     if not os.access(place, os.W_OK | os.X_OK):
+        where = "" if place == asset else f"{place} is "
         raise EnvironmentFailure(
-            f"{asset}: {place} is not writable. Change its permission or name another folder. "
+            f"{asset}: {where}not writable. Change its permission or name another folder. "
             "[environment.output]"
         )
     for link in (folder for folder in (asset, *asset.parents) if folder.is_symlink()):

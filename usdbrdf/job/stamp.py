@@ -23,9 +23,14 @@ from usdbrdf.files.documents import json_text, read_json, write_json
 from usdbrdf.identity import tasks_identity
 
 
-def hash_of_files(files: Iterable[Path], root: Path | None = None) -> str:
+def hash_of_files(
+    files: Iterable[Path], root: Path | None = None, each: dict[Path, str] | None = None
+) -> str:
     """One SHA-256 over names (relative to ``root``, if given) and contents of many files, wherever
-    they lie, in the order in which they come; InputRefused where one is missing."""
+    they lie, in the order in which they come; InputRefused where one is missing.
+
+    each  is told the SHA-256 of every file
+    """
     names = list(files)
     for name in names:
         if not name.is_file():
@@ -35,6 +40,8 @@ def hash_of_files(files: Iterable[Path], root: Path | None = None) -> str:
             )
     with environment_failures("reading the inputs"), ThreadPoolExecutor() as pool:
         digests = list(pool.map(sha256_of, names))
+    if each is not None:
+        each.update(zip(names, digests, strict=True))
     lines = [
         f"{name.relative_to(root).as_posix() if root else name.name}\0{digest}\n"
         for name, digest in zip(names, digests, strict=True)

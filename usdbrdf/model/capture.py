@@ -32,7 +32,7 @@ class Frames:
                           down -z)
     intrinsics            (N, 4) float64: fx, fy, cx, cy in pixels; the first pixel's centre is
                           (0.5, 0.5)
-    resolution            (N, 2) int32: width, height
+    resolution            (N, 2) int32: width, height; 0 where only the pixels are asked for
     exposure_time         (N,) float64, seconds (1 where unknown)
     saturation_radiance   (N,) float64: a channel >= 0.998 of it is clipped
     noise_floor_radiance  (N,) float64: a channel below it is noise
@@ -79,15 +79,25 @@ class Frames:
 
     def recorded_in(self) -> list[Path]:
         """The photographs and masks that all frames come from, each once."""
-        sources = self.photographs or (None,) * len(self)
-        found = [s or path for s, path in zip(sources, self.image_paths, strict=True)]
-        return list(dict.fromkeys([*found, *filter(None, self.masks)]))
+        of_frames = self.recorded_by()
+        masks = (mask for _, *some in of_frames for mask in some)
+        return list(dict.fromkeys([*(photograph for photograph, *_ in of_frames), *masks]))
+
+    def recorded_by(self) -> list[tuple[Path, ...]]:
+        """The photograph that each frame comes from, and its mask, where it has one."""
+        nothing = (None,) * len(self)
+        columns = self.image_paths, self.photographs or nothing, self.masks or nothing
+        return [
+            (photograph or image, *filter(None, [mask]))
+            for image, photograph, mask in zip(*columns, strict=True)
+        ]
 
     def as_recorded(self) -> Frames:
         """With the photographs for images, of which the cameras are not: for their pixels alone."""
         given = self.photographs or (None,) * len(self)
         images = tuple(p or image for p, image in zip(given, self.image_paths, strict=True))
-        return replace(self, image_paths=images)
+        unasked = np.zeros_like(self.resolution) if self.photographs else self.resolution
+        return replace(self, image_paths=images, resolution=unasked)
 
     def images_alone(self) -> Frames:
         """Without what they were resampled from."""

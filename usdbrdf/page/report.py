@@ -175,10 +175,12 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
 def _refuse_without_photographs(asset: Asset, frames: Frames) -> None:
     gone = [path for path in frames.image_paths if not path.is_file()]
     if gone:
+        which = f"{len(gone)} of its {len(frames)} photographs are not there, such as {gone[0]}"
+        if not asset.photographs_layer.is_file():
+            which = f"it has no layers/{asset.photographs_layer.name}, which tells of photographs"
         raise InputRefused(
-            f"{asset.folder}: {len(gone)} of its {len(frames)} photographs are not there, such as "
-            f"{gone[0]}, and the page is made from them. Make it of the asset beside its capture, "
-            "or of a version that was published with them. [report.photographs]"
+            f"{asset.folder}: {which}, and the page is made from them. Make it of the asset beside "
+            "its capture, or of a version that was published with them. [report.photographs]"
         )
 
 

@@ -30,26 +30,32 @@ def parameters_of(options: IngestOptions) -> dict[str, Any]:
 
 def inputs_of_captures(
     captures: Mapping[str, tuple[Path, Sequence[Path]]], options: IngestOptions, asset: Asset
-) -> tuple[dict[str, str], dict[str, str]]:
+) -> tuple[dict[str, str], dict[str, str], dict[Path, str]]:
     """``inputs_of_capture`` of each lighting's capture and the files beside it, with the lighting's
-    name behind every label; of the only one, "", as they are."""
+    name behind every label; of the only one, "", as they are. And the hash of every file."""
     inputs: dict[str, str] = {}
+    each: dict[Path, str] = {}
     places: dict[str, str] = {}
     for lighting, (capture, beside) in captures.items():
         behind = f".{lighting}" if lighting else ""
-        found = inputs_of_capture(capture, options, asset, beside)
+        found = inputs_of_capture(capture, options, asset, each, beside)
         for every, some in zip((inputs, places), found, strict=True):
             every.update({f"{label}{behind}": value for label, value in some.items()})
-    return inputs, places
+    return inputs, places, each
 
 
 def inputs_of_capture(
-    capture: Path, options: IngestOptions, asset: Asset, beside: Sequence[Path]
+    capture: Path,
+    options: IngestOptions,
+    asset: Asset,
+    each: dict[Path, str],
+    beside: Sequence[Path],
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Hashes of all that ingest may read: the capture's folder and those that its documents may
     point into, without the asset if that lies in one, what options name, and the files ``beside``
     that its adapter reads. And where these lie, seen from scan.usdc, which names photographs and
-    USD geometry by such paths: what is moved must be read anew."""
+    USD geometry by such paths: what is moved must be read anew. ``each`` is told the hash of every
+    file in these folders."""
     folder = (capture if capture.is_dir() else capture.parent).resolve()
     refuse_missing(capture)
     outside = {f"outside-{i}": place.resolve() for i, place in enumerate(options.allow_outside)}
@@ -64,6 +70,7 @@ def inputs_of_capture(
                 if f.resolve() != objects.resolve()
             ],
             place,
+            each,
         )
         for label, place in ({"capture": folder} | outside).items()
     } | _inputs_of_objects(objects)

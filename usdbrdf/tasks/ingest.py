@@ -65,7 +65,7 @@ def ingest(
         name: choose_adapter(path, adapter, plugins=plugins) for name, path in captures.items()
     }
     beside = {k: (p, files_beside(chosen[k], p, options.mesh)) for k, p in captures.items()}
-    inputs, places = inputs_of_captures(beside, options, asset)
+    inputs, places, hashes = inputs_of_captures(beside, options, asset)
     # Our own adapters change with the version of the code, which every stamp holds.
     if packages := sorted({one.package for one in chosen.values() if one.package}):
         parameters["adapter_package"] = ", ".join(packages)
@@ -92,7 +92,7 @@ def ingest(
                 write_capture(as_copied(scan, scans[name]), images, copy_to)
         scan = scan_of_lightings(scans, options.crease_angle_deg)
         draft = Draft(asset=asset, header=header, provenance=task.provenance)
-        write_scan_layer(ScanFiles.of(asset, run.output), scan, draft)
+        write_scan_layer(ScanFiles.of(asset, run.output), scan, draft, hashes)
         write_root(run.output_once(asset.root_layer.name), asset, header, scan.capture_up)
         write_edits(run.output_once(asset.edits_layer.name), asset, header)
         write_layers_to_come(run, asset, lightings, header)

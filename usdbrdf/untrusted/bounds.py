@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.errors import InputRefused, MeshMissing, UsdBrdfError
 from usdbrdf.job.child import run_child
 from usdbrdf.job.memory import addresses_of_libraries, machine_bytes
 from usdbrdf.model.arrays import Array, Double, Float
@@ -131,7 +131,8 @@ def refuse_large(kind: str, path: Path) -> None:
     if not os.path.isfile(path) or not os.access(path, os.R_OK):
         what = "cannot be read" if os.path.isfile(path) else "is not a regular file"
         what = what if os.path.exists(path) else "does not exist"
-        raise InputRefused(f"{path}: this {kind} {what}. {_CURES[kind]} [{kind}.missing]")
+        refused = MeshMissing if kind == "mesh" else InputRefused
+        raise refused(f"{path}: this {kind} {what}. {_CURES[kind]} [{kind}.missing]")
     size, limit = path.stat().st_size, LIMITS[kind].file_bytes
     if size > limit:
         raise InputRefused(

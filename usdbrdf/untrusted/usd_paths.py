@@ -136,6 +136,11 @@ def _target(layer: str, reference: str, allowed: Sequence[str], *, opens: bool) 
         target = os.path.realpath(str(Ar.GetResolver().Resolve(name)) or target or allowed[0])
     if not any(Path(target).is_relative_to(folder) for folder in allowed):
         raise _outside(layer, reference, "leads outside the capture")
+    if os.path.exists(target) and not (os.path.isfile(target) or os.path.isdir(target)):
+        raise InputRefused(
+            f"{target}: not a regular file, and {layer} names it. Put the file there, or take the "
+            "path out of the stage. [stage.file]"
+        )
     return _with_entry(target, inner) if os.path.isfile(target) else ""
 
 

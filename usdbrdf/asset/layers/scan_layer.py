@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ from usdbrdf.asset.layout import LIGHTING, Asset, relative_path, storable_path
 from usdbrdf.asset.properties import LabelledObject, Photographs, facts_of, known_facts
 from usdbrdf.asset.readers.scene import LENS
 from usdbrdf.errors import InputRefused, OwnershipConflict
+from usdbrdf.files.atomic import environment_failures, sha256_of
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames, Recorded, Scan
@@ -53,8 +55,9 @@ from usdbrdf.model.mesh import ObjectLabel, is_closed
 Types = Sdf.ValueTypeNames
 APERTURE_MM = 36.0
 NEAR_M, FAR_M = 0.01, 1000.0
-# Facts of the photographs that name files.
+# Facts of the photographs that name files, and the one that tells them from others of that name.
 _PLACES = ("image", "photograph", "mask")
+_OF_FILES = (*_PLACES, "sha256")
 
 
 def check_root(asset: Asset, header: StageHeader, capture_up: str = "") -> None:
@@ -158,8 +161,13 @@ class ScanFiles:
         return ScanFiles(scan=scan, interface=interface, photographs=photographs, place=place)
 
 
-def write_scan_layer(files: ScanFiles, scan: Scan, draft: Draft) -> None:
-    """Write the capture as it came; objects without a face are left out."""
+def write_scan_layer(
+    files: ScanFiles, scan: Scan, draft: Draft, hashes: Mapping[Path, str] = MappingProxyType({})
+) -> None:
+    """Write the capture as it came; objects without a face are left out.
+
+    hashes  the SHA-256 of photographs and masks, as far as they are known
+    """
     folder, frames = draft.asset.layer("scan").parent, scan.frames
     stage = input_usd.open_input(scan.usd_geometry) if scan.usd_geometry else None
     source = stage.GetDefaultPrim() if stage else None
@@ -206,7 +214,7 @@ def write_scan_layer(files: ScanFiles, scan: Scan, draft: Draft) -> None:
     relationship(settings, "camera", scopes.path("cameras", "capture"))
     attribute(settings, "renderingColorSpace", Types.Token, "lin_rec709_scene", uniform=True)
     export(layer, files.scan, folder=folder)
-    _write_photographs(files.photographs, frames, draft, scopes)
+    _write_photographs(files.photographs, frames, draft, scopes, hashes)
     write_scan_interface(files.interface, scan, draft, scopes, components, source)
     write_components(files.place, draft, scopes, components)
 
@@ -302,9 +310,9 @@ def _author_capture(prim: Sdf.PrimSpec, frames: Frames) -> None:
         attribute(prim, f"exposure{name}", Types.Float, value)
     attribute_per_frame(prim, "exposure:time", Types.Float, times)
     attribute_per_frame(prim, "exposure:responsivity", Types.Float, [1.0 / time for time in times])
-    places = dict.fromkeys(_PLACES, [""] * len(frames))
+    places = dict.fromkeys(_OF_FILES, [""] * len(frames))
     for fact, value in known_facts(_record_of(frames, places)):
-        if fact.name not in _PLACES:
+        if fact.name not in _OF_FILES:
             author_fact(prim, fact, value)
 
 
@@ -320,7 +328,9 @@ def _record_of(frames: Frames, places: Mapping[str, Sequence[str]]) -> Photograp
     return Photographs(**said)
 
 
-def _write_photographs(path: Path, frames: Frames, draft: Draft, scopes: Scopes) -> None:
+def _write_photographs(
+    path: Path, frames: Frames, draft: Draft, scopes: Scopes, hashes: Mapping[Path, str]
+) -> None:
     """Where the photographs lie, for us and where applications look for plates (new in USD 26.11;
     older versions pass over a schema that they do not know), muted: no render may change because of
     them. A layer of its own: an asset that is copied or published is whole without the capture."""
@@ -334,9 +344,14 @@ def _write_photographs(path: Path, frames: Frames, draft: Draft, scopes: Scopes)
         name: [storable_path(file, folder) if file else "" for file in paths]
         for name, paths in zip(_PLACES, given, strict=True)
     }
+    with environment_failures(str(path)):
+        files["sha256"] = [
+            " ".join(hashes.get(file) or sha256_of(file) for file in recorded if file.is_file())
+            for recorded in frames.recorded_by()
+        ]
     prim = over(layer, scopes.path("cameras", "capture"))
     for fact, value in known_facts(_record_of(frames, files)):
-        if fact.name in _PLACES:
+        if fact.name in _OF_FILES:
             author_fact(prim, fact, value)
     plates = [Sdf.AssetPath(image) for image in files["image"]]
     apply_schema(prim, "BackPlateAPI:photograph")

@@ -243,8 +243,24 @@ def hashes_of_inputs(
         raise InputRefused(f"{picture}: no such file. Check --environment. [shading.environment]")
     behind = f".{asset.lighting}" if asset.lighting else ""
     layers = [*_weaker_layers(asset, role), *_beneath(asset)]
-    by_label = {layer.name: sha256_of(layer) for layer in layers}
-    return by_label | {f"{k}{behind}": hash_of_files(some) for k, some in files.items() if some}
+    by_label, each = {layer.name: sha256_of(layer) for layer in layers}, dict[Path, str]()
+    by_label |= {f"{k}{behind}": hash_of_files(v, each=each) for k, v in files.items() if v}
+    if photographs:
+        _refuse_other_photographs(maps, each)
+    return by_label
+
+
+def _refuse_other_photographs(maps: AssetMaps, hashes: Mapping[Path, str]) -> None:
+    """InputRefused where a photograph or mask is not the one that ingest has looked at: what it
+    found of poses, sizes, exposures and damage is not true of another."""
+    for files, before in zip(maps.frames.recorded_by(), maps.hashes_of_frames, strict=True):
+        for file, known in zip(files, before.split(), strict=False):
+            if hashes[file] != known:
+                raise InputRefused(
+                    f"{file}: not the file that the capture was read with: its content has "
+                    "changed. Bring that back, or run `usdbrdf convert`, or `usdbrdf ingest`, "
+                    "with the capture again. [input.changed]"
+                )
 
 
 def outdated_steps(asset: Asset) -> list[str]:

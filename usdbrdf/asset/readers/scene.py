@@ -110,6 +110,15 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
     )
 
 
+def hashes_of_photographs(stage: Usd.Stage) -> list[str]:
+    """The SHA-256 of each frame's photograph, and of its mask behind a space, as ingest read them,
+    in the order of time; "" where nothing tells."""
+    camera = capture_camera(stage).GetPrim()
+    times = camera.GetAttribute(_EXPOSURE).GetTimeSamples()
+    said = camera.GetAttribute(CAPTURE.attribute("sha256"))
+    return [str((said and said.Get(time)) or "") for time in times]
+
+
 def capture_camera(stage: Usd.Stage) -> UsdGeom.Camera:
     """The camera that carries the photographs."""
     for prim in stage.Traverse():

@@ -97,12 +97,21 @@ def refuse_special_behind(layer: str) -> None:
         if found is None:
             continue
         kept.append(found)  # or it would be read again
-        for name in found.GetCompositionAssetDependencies():
+        for name in {*found.GetCompositionAssetDependencies(), *_clips_of(found)}:
             place, _ = Sdf.Layer.SplitIdentifier(found.ComputeAbsolutePath(name))
             if place not in seen:
                 _refuse_special([Path(place)])
                 seen.add(place)
                 waiting.append(place)
+
+
+def _clips_of(layer: Sdf.Layer) -> list[str]:
+    """What else a layer names that USD may open as one, among it the files of value clips, which
+    are no dependencies of the composition."""
+    with suppress(Tf.ErrorException):
+        named = UsdUtils.ExtractExternalReferences(layer.identifier)
+        return [name for kind in named for name in kind if Path(name).suffix in _ENDINGS]
+    return []
 
 
 def _refuse_special(files: Sequence[Path]) -> None:

@@ -24,7 +24,7 @@ from usdbrdf.capture.parts import (
     radiance_encoding,
     scan_from_parts,
 )
-from usdbrdf.errors import ImageRefused, InputRefused, UsageError
+from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
 from usdbrdf.files.paths import contained
@@ -368,7 +368,7 @@ def refuse_without_pictures(pictures: Pictures, source: Path) -> None:
 
 def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) -> Path:
     """``--mesh``, else the first of the ``usual`` files (patterns) that is there, else the one mesh
-    of the folder; InputRefused, which says ``how`` to get one, where there is none."""
+    of the folder; MeshMissing, which says ``how`` to get one, where there is none."""
     if options.mesh is not None:
         return options.mesh
     for pattern in usual:
@@ -385,7 +385,7 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
         said += f" that is read ({unread[0]} is none of {', '.join(_MESHES)})"
     elif there and not others:
         said += f" ({there[0].name} holds points alone)"
-    raise InputRefused(f"{folder}: {said}. {how}, or name one with --mesh. [mesh.missing]")
+    raise MeshMissing(f"{folder}: {said}. {how}, or name one with --mesh. [mesh.missing]")
 
 
 def scan_of(

@@ -25,7 +25,7 @@ from usdbrdf.capture.parts import (
     radiance_encoding,
     scan_from_parts,
 )
-from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.model.capture import Scan
@@ -148,7 +148,7 @@ def _mesh(folder: Path, options: CaptureOptions) -> Path:
         path = path_in_capture(folder, name, options)
         if path.is_file():
             return path
-    raise InputRefused(
+    raise MeshMissing(
         f"{folder}: no mesh ({', '.join(_MESHES)}). Export the mesh into this folder, or name one "
         "with --mesh. [mesh.missing]"
     )

@@ -20,7 +20,7 @@ from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, scan_of_shots
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, MeshMissing
 from usdbrdf.files.tables import Element, beginning_of_text, files_of, numbers_of, read_xml
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -103,7 +103,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 def _refined_once(tiles: list[Path], source: Path) -> list[Path]:
     """The files of a model, one of each tile; InputRefused where these have levels of detail."""
     if len({tile.parent for tile in tiles}) < len(tiles):
-        raise InputRefused(
+        raise MeshMissing(
             f"{source}: the tiles of its model in Data/ have levels of detail. Produce it without "
             "these, or name one mesh of the whole with --mesh. [mesh.missing]"
         )

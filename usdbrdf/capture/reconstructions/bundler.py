@@ -18,8 +18,8 @@ from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import (
     CentredCamera,
     Shot,
+    capture_folder_of,
     files_of_capture,
-    folder_of,
     scan_of_shots,
 )
 from usdbrdf.errors import InputRefused
@@ -86,14 +86,14 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 def beside(path: Path) -> list[Path]:
     """What lies above Bundler's own folder, where that is named."""
     home = _home(path)
-    if home == folder_of(path):
+    if home == capture_folder_of(path):
         return []
     return [*home.glob(_LISTS), *files_of_capture(home, meshes=_MESHES)]
 
 
 def _home(path: Path) -> Path:
     """The capture's folder: that above Bundler's own, where this is named and has not all."""
-    folder = folder_of(path)
+    folder = capture_folder_of(path)
     whole = (folder / _UNDISTORTED).is_dir() or any(folder.glob(_LISTS))
     return folder.parent if folder.name == _FOLDER and not whole else folder
 

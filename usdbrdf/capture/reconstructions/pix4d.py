@@ -18,8 +18,8 @@ from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import (
     Shot,
     ShotCamera,
+    capture_folder_of,
     files_of_capture,
-    folder_of,
     scan_of_shots,
 )
 from usdbrdf.errors import InputRefused
@@ -75,12 +75,12 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 def beside(path: Path) -> list[Path]:
     """What the project holds above the folder of its parameters, where that is named."""
     home = _home(path)
-    return [] if home == folder_of(path) else files_of_capture(home, meshes=_MESHES)
+    return [] if home == capture_folder_of(path) else files_of_capture(home, meshes=_MESHES)
 
 
 def _home(path: Path) -> Path:
     """The capture's folder: the project's, where a place in it is named."""
-    folder = folder_of(path)
+    folder = capture_folder_of(path)
     place = Path(_PLACE).parts
     return folder.parents[len(place) - 1] if folder.parts[-len(place) :] == place else folder
 

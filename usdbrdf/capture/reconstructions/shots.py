@@ -24,7 +24,7 @@ from usdbrdf.capture.formats.named_pictures import (
 )
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
-from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing
 from usdbrdf.files.images import image_size
 from usdbrdf.files.tables import numbers_among
 from usdbrdf.model.arrays import Double
@@ -91,7 +91,7 @@ def size_in(row: dict[str, Any], first: str = "width", second: str = "height") -
     return (0, 0) if size is None or not (size >= 1).all() else (int(size[0]), int(size[1]))
 
 
-def folder_of(path: Path) -> Path:
+def capture_folder_of(path: Path) -> Path:
     """A folder, or that of a file, absolute."""
     path = path.resolve()
     return path if path.is_dir() else path.parent
@@ -211,8 +211,8 @@ def scan_of_shots(
     def geometry() -> Path | ScanGeometry:
         try:
             return mesh_beside(folder, options, *meshes, how=how)
-        except InputRefused as error:
-            if not str(error).endswith("[mesh.missing]") or not (some := tiles()):
+        except MeshMissing:
+            if not (some := tiles()):
                 raise
         names = [tile.relative_to(folder).as_posix() for tile in some]
         findings.warn(
