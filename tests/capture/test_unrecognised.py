@@ -53,7 +53,7 @@ DOCUMENTS = [
     ("pose_intrinsic_imu.json", '{"0": {}}', "ScanNet++'s telephone", "holds dslr/"),
     ("data.jsonl", '{"time": 1.0}', "Spectacular AI", "sai-cli process"),
     ("1.json", '{"orientation": [[1]], "pixel_aspect_ratio": 1}', "Nerfies", "a transforms.json"),
-    ("camera_path.json", '{"keyframes": []}', "a path that nerfstudio renders along", "of the photo"),
+    ("camera_path.json", '{"keyframes": []}', "nerfstudio's renders", "of the photographs"),
     ("extri.yml", "%YAML:1.0\n", "EasyMocap", "a transforms.json"),
     ("CameraTrajectory.txt", "1.5 0 0 0 0 0 0 1\n", "ORB-SLAM", "fuse the"),
     ("poses.txt", "1e0 0 0 0 0 1 0 0 0 0 1 0\n", "KITTI", "a transforms.json"),

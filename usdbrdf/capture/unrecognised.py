@@ -156,7 +156,7 @@ _PROGRAMS = (
     ),
     # Along which it is rendered, or which its viewer has stored.
     _Program(
-        "a path that nerfstudio renders along", (), ("camera_path",), _NOTHING,
+        "nerfstudio's renders", (), ("camera_path",), _NOTHING,
         "Name the transforms.json of the photographs",
     ),
     _Program(
