@@ -208,9 +208,13 @@ _PROGRAMS = (
 
 
 def other_program(document: Path) -> str:
-    """Whose cameras a file holds that are not read, and how to have them read; else ""."""
+    """Whose cameras a file holds that are not read, and how to have them read, or that it has not
+    been fetched; else ""."""
+    from usdbrdf.files.paths import why_not_fetched
     from usdbrdf.files.tables import beginning_of
 
+    if (why := why_not_fetched(document)) is not None:
+        return f"{document.name} is {why}"
     head = beginning_of(document, _HEAD)
     for one in _PROGRAMS:
         if one.owns(document, head):
