@@ -49,6 +49,9 @@ _LARGEST = 1e9  # number that makes sense in a matrix
 # By which instant-ngp's meshes are known, PLY and OBJ; what it takes where a document says nothing.
 _OF_NGP = (b"output from https://github.com/NVlabs/instant-ngp", b"mtllib nerf.mtl")
 _NGP_SCALE, _NGP_OFFSET = 0.33, 0.5
+# Lenses that it has by a key: the longitudes and latitudes of a whole sphere, their equal-area
+# cylinder, none, and a polynomial of the pixels' distance.
+_NGP_LENSES = ("latlong", "equirectangular", "orthographic", "ftheta_p0")
 _NGP_AXES = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
@@ -85,6 +88,26 @@ def stated_pose(matrix: object) -> Double | None:
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0.0, 0, 0, 1]])
     return pose if pose.shape == (4, 4) and (np.abs(pose) <= LARGEST_OF_POSE).all() else None
+
+
+def rolling_shutter(holder: Mapping[str, Any]) -> list[Any]:
+    """What instant-ngp's rolling_shutter says, times of which each is 0 where there is none."""
+    stated = holder.get("rolling_shutter")
+    return stated if isinstance(stated, list) else [stated]
+
+
+def lens_key(said: Mapping[str, Any]) -> str:
+    """The camera_model that is meant by one of instant-ngp's keys for its lenses (read_lens); the
+    key itself where no model that is known is; "" where there is none."""
+    key = next((key for key in _NGP_LENSES if said.get(key) not in (None, False)), "")
+    return "EQUIRECTANGULAR" if key == "latlong" else key
+
+
+def camera_axes(document: Mapping[str, Any]) -> Double:
+    """(4, 4) by which the document's cameras become OpenGL's: those that instant-ngp knows as
+    Mitsuba's have x to the left and look down +z (nerf_matrix_to_ngp)."""
+    is_mitsuba = document.get("from_mitsuba", "normal_mts_args" in document)
+    return np.diag([-1.0, 1, -1, 1]) if is_mitsuba is True else np.eye(4)
 
 
 def rigid_matrix(stated: object) -> Double | None:
