@@ -235,6 +235,26 @@ def test_the_points_of_the_model_tell_in_which_frame_a_mesh_lies(capture, folder
         assert ["it stays there" in said for said in told] == [True] * (name != "mesh.ply")
 
 
+@pytest.mark.parametrize("lies", ["with the model", "with the document"])
+def test_a_mesh_in_the_frame_of_the_documents_poses_is_undone_as_they_are(capture, lies):
+    """As it is fused of depths and these poses; that of COLMAP lies in the frame before."""
+    folder, scale = "colmap/sparse/0", 1.5
+    _recentred(capture, folder, similarity=np.eye(4), points=_points_on(capture))
+    with edited(capture.manifest) as document:
+        document |= {"applied_transform": Y_UP[:3].tolist(), "applied_scale": scale}
+        for frame in document["frames"]:
+            pose = Y_UP @ np.array(frame["transform_matrix"])
+            pose[:3, 3] *= scale
+            frame["transform_matrix"] = pose.tolist()
+    if lies == "with the document":
+        stored = scale * (capture.points @ Y_UP[:3, :3].T + Y_UP[:3, 3])
+        write_ply(capture.folder / "mesh.ply", stored, capture.triangles, capture.face_object)
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-5)
+    told = [said for said in scan.warnings if "applied_transform is undone of it" in said]
+    assert len(told) == (lies == "with the document")
+
+
 def test_cameras_of_one_name_in_several_folders_are_told_apart(capture):
     """As rigs have them."""
     similarity = np.eye(4)

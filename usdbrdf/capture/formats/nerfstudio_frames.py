@@ -153,7 +153,7 @@ def geometry_at_home(
         return _moved(read, np.asarray(home, np.float64), options, meters_per_unit)
     statements = statements_beside(mesh)
     if mesh.suffix.lower() in MESH_SUFFIXES and (mesh.name in _COLMAPS or not statements):
-        known = _home_of_colmaps(mesh, folder, findings)
+        known = _home_of_colmaps(mesh, folder, findings, applied)
         if known is not None:
             return _moved(read, known, options, meters_per_unit)
     if statements and mesh.suffix.lower() in USD_SUFFIXES:
@@ -224,16 +224,30 @@ def _trained_from_capture(statement: Path, applied: Applied) -> Double:
     return np.asarray(trained @ inner @ applied.similarity, np.float64)
 
 
-def _home_of_colmaps(mesh: Path, folder: Path, findings: Findings) -> Double | None:
+def _home_of_colmaps(
+    mesh: Path, folder: Path, findings: Findings, applied: Applied
+) -> Double | None:
     """The similarity (4, 4) to the capture's frame of a mesh beside a model of COLMAP: from the
     model's if it lies as the points of that do, none if it lies where the cameras take these. Where
-    they do not tell, its name does; None where that does not either."""
+    they do not tell, its name does; None where that does not either. Of a model in the capture's
+    frame: from the document's, if it lies where what was applied takes the points."""
     of_colmap = mesh.name in _COLMAPS
     found = _capture_from_colmap(mesh, folder, findings, tells=of_colmap)
     if found is None:
         return None
     model, moved = found
-    name, lies = model.relative_to(folder).as_posix(), lies_with_points(mesh, model, moved)
+    name = model.relative_to(folder).as_posix()
+    if np.abs(moved - np.eye(4)).max() < _SAME_FRAME:
+        stored = applied.similarity
+        is_same = np.abs(stored - np.eye(4)).max() < _SAME_FRAME
+        if is_same or lies_with_points(mesh, model, stored) is not False:
+            return None
+        findings.warn(
+            f"{mesh.name}: lies in the frame of the document's poses, by the points of the model "
+            f"{name}, and applied_transform is undone of it as it is of these. [mesh.frame]"
+        )
+        return np.asarray(np.linalg.inv(stored), np.float64)
+    lies = lies_with_points(mesh, model, moved)
     if lies is False:
         if of_colmap:
             findings.warn(
@@ -256,8 +270,8 @@ def _capture_from_colmap(
     mesh: Path, folder: Path, findings: Findings, *, tells: bool
 ) -> tuple[Path, Double] | None:
     """The model of COLMAP beside a document, and the similarity (4, 4) from its frame to the
-    capture's; None where there is none, the frame is the same, or nobody knows as it has not the
-    same cameras, which is told if it ``tells``."""
+    capture's; None where there is none, or nobody knows as it has not the same cameras, which is
+    told if it ``tells``."""
     models, frames = _models_beside(folder), findings.frames
     if not models or frames is None:
         return None
@@ -300,8 +314,7 @@ def _capture_from_colmap(
     if max(np.abs(turns - turn).max(), off.max() / spread) > _SAME_CAMERA:
         unknown(others)
         return None
-    moved = rigid_pose(scale * turn, centre - scale * from_centre)
-    return None if np.abs(moved - np.eye(4)).max() < _SAME_FRAME else (models[0], moved)
+    return models[0], rigid_pose(scale * turn, centre - scale * from_centre)
 
 
 def _by_ends(names: Sequence[str]) -> dict[tuple[str, ...], int | None]:
