@@ -351,6 +351,17 @@ def test_photographs_of_a_folder_are_one_bracket(tmp_path):
     assert np.nanmedian(np.abs(ratio - 1)) < 0.02
 
 
+def test_what_is_told_of_a_folder_names_it_and_no_document_that_is_not_there(tmp_path, capsys):
+    pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")
+    folder, times = tmp_path / "stack", 4.0 ** -np.arange(6.0)
+    folder.mkdir()
+    for k, codes in enumerate(_shoot(_scene((60, 80), decades=3), times)):
+        _write_photograph(folder / f"IMG_{k}.png", codes, time=times[k] * (1.2 if k == 2 else 1))
+    assert main(["merge-brackets", str(folder), "-o", str(tmp_path / "merged")]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "brackets.flicker" in line]
+    assert told == [line for line in told if f"{folder}: " in line] != []
+
+
 @pytest.mark.parametrize("profile", ["Adobe RGB (1998)", "ProPhoto RGB", "sRGB IEC61966-2.1"])
 def test_a_profile_that_is_not_known_is_told(tmp_path, monkeypatch, capsys, profile):
     pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.json_schemas import checked
-from tests.scenes import MadeCapture, edited, make_capture
+from tests.scenes import MadeCapture, edited, make_capture, rescale_images
 from usdbrdf.asset.layout import Asset
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.inspection import inspect
@@ -92,6 +92,15 @@ def test_a_refusal_comes_with_what_was_read_by_then(capture, capsys):
     assert told["refused"] == [{"sentence": str(refused.value), "exit_code": 3}]
     assert (told["frames"]["count"], told["mesh"], told["missing"]) == (12, None, ["mesh"])
     assert told["radiance"]["brightest"] > 0.4
+
+
+@pytest.mark.parametrize("mesh", [True, False])
+def test_cameras_are_told_at_the_size_of_the_pictures(capture, mesh):
+    rescale_images(capture, 0.5)
+    if not mesh:
+        (capture.folder / "mesh.ply").unlink()
+    (row,) = (r for r in inspect(capture.folder, InspectOptions()).lines() if r.startswith("camer"))
+    assert "16 x 12 pixels" in row
 
 
 def test_photographs_are_read_on_as_if_they_were_granted(capture):

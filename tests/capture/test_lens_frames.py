@@ -17,7 +17,9 @@ from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
 from usdbrdf.asset.readers.views import photographs_of_views
 from usdbrdf.capture import develop
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.develop import resampled
+from usdbrdf.capture.formats.transforms import frame_records
 from usdbrdf.capture.lens_views import pinhole_views, why_no_lens
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
@@ -448,6 +450,16 @@ def test_faces_that_the_mask_hides_are_left_out(tmp_path):
     assert [view.face for view in scan.views] == [
         "front", "right", "left", "up", "down", "back", *["front"] * 7
     ]  # fmt: skip
+
+
+def test_a_whole_sphere_by_the_key_that_instant_ngp_has_for_it(tmp_path):
+    made = capture_through(tmp_path / "room", "EQUIRECTANGULAR", frames=8)
+    with edited(made.manifest) as document:
+        for holder in (document, *document["frames"]):
+            holder.pop("camera_model", None)
+        document["latlong"] = True
+    records = frame_records(made.manifest, IngestOptions(), Findings())
+    assert {record.lens.curve for record in records} == {"equirectangular"}
 
 
 def test_lenses_of_documents_and_of_single_frames(tmp_path):

@@ -158,12 +158,14 @@ def test_a_usd_mesh_in_the_frame_of_the_training_is_refused(capture):
     np.testing.assert_allclose(np.ptp(scan.mesh.points, axis=0), np.ptp(capture.points, axis=0))
 
 
-def _recentred(made, folder, *, similarity, names=None):
+def _recentred(made, folder, *, similarity, names=None, points=()):
     """COLMAP's model of a capture in ``folder``, and its document as colmap2nerf.py leaves it:
     the world turned, moved and scaled, and no word of that."""
     names = names or [f"{i:04d}.exr" for i in range(len(made.world_from_camera))]
     camera = pycolmap.Camera(model="PINHOLE", width=32, height=24, params=[24.0, 24, 16, 12])
     model = reconstruction(made, [camera], names)
+    for point in points:
+        model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
     write_model(made.folder / folder, model, text="text" in folder)
     scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
     with edited(made.manifest) as document:
@@ -188,9 +190,69 @@ def test_colmaps_mesh_is_brought_to_poses_that_instant_ngp_moved(capture):
     mesh.rename(capture.folder / "meshed-poisson.ply")
     scan = read_scan(capture.folder, IngestOptions())
     np.testing.assert_allclose(scan.mesh.points, expected, atol=1e-5)
-    assert any(f"the frame of its model {folder}; it is brought" in said for said in scan.warnings)
+    assert any(
+        f"the frame of COLMAP's model {folder}; it is brought" in said for said in scan.warnings
+    )
     scan = read_scan(capture.folder, IngestOptions(), "colmap")
     np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-5)
+
+
+def _points_on(made, count=400):
+    """(count, 3) on the surface of what a capture was made of, a hundredth of its size off it."""
+    chance = np.random.default_rng(3)
+    corners = made.points[made.triangles[chance.integers(len(made.triangles), size=count)]]
+    places = (chance.dirichlet((1, 1, 1), count)[:, :, None] * corners).sum(axis=1)
+    return places + chance.normal(scale=0.01 * np.ptp(made.points), size=places.shape)
+
+
+@pytest.mark.parametrize("folder", ["colmap_sparse/0", "colmap_text"])
+@pytest.mark.parametrize("name", ["mesh.ply", "meshed-poisson.ply"])
+@pytest.mark.parametrize("lies", ["with the model", "with the poses", "elsewhere"])
+def test_the_points_of_the_model_tell_in_which_frame_a_mesh_lies(capture, folder, name, lies):
+    """Whatever it is called: renamed ones lay elsewhere, and moved ones were moved again."""
+    similarity = np.eye(4)
+    similarity[:3, :3] = 1.7 * Rotation.from_euler("xyz", [70, 10, -50], degrees=True).as_matrix()
+    similarity[:3, 3] = 0.3, -0.2, 0.5
+    _recentred(capture, folder, similarity=similarity, points=_points_on(capture))
+    expected = capture.points @ similarity[:3, :3].T + similarity[:3, 3]
+    stored = {"with the model": capture.points, "with the poses": expected}.get(lies)
+    if stored is None:
+        stored = 0.8 * expected + np.ptp(expected)
+    (capture.folder / "mesh.ply").unlink()
+    (capture.folder / "objects.json").unlink()
+    write_ply(capture.folder / name, stored, capture.triangles, capture.face_object)
+    options = IngestOptions()
+    if lies == "elsewhere":
+        with pytest.raises(InputRefused):
+            read_scan(capture.folder, options)
+        return
+    scan = read_scan(capture.folder, options)
+    np.testing.assert_allclose(scan.mesh.points, expected, atol=1e-5)
+    told = [said for said in scan.warnings if "[mesh.frame]" in said]
+    if lies == "with the model":
+        assert [f"lies in the frame of COLMAP's model {folder};" in said for said in told] == [True]
+    else:
+        assert ["it stays there" in said for said in told] == [True] * (name != "mesh.ply")
+
+
+@pytest.mark.parametrize("lies", ["with the model", "with the document"])
+def test_a_mesh_in_the_frame_of_the_documents_poses_is_undone_as_they_are(capture, lies):
+    """As it is fused of depths and these poses; that of COLMAP lies in the frame before."""
+    folder, scale = "colmap/sparse/0", 1.5
+    _recentred(capture, folder, similarity=np.eye(4), points=_points_on(capture))
+    with edited(capture.manifest) as document:
+        document |= {"applied_transform": Y_UP[:3].tolist(), "applied_scale": scale}
+        for frame in document["frames"]:
+            pose = Y_UP @ np.array(frame["transform_matrix"])
+            pose[:3, 3] *= scale
+            frame["transform_matrix"] = pose.tolist()
+    if lies == "with the document":
+        stored = scale * (capture.points @ Y_UP[:3, :3].T + Y_UP[:3, 3])
+        write_ply(capture.folder / "mesh.ply", stored, capture.triangles, capture.face_object)
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-5)
+    told = [said for said in scan.warnings if "applied_transform is undone of it" in said]
+    assert len(told) == (lies == "with the document")
 
 
 def test_cameras_of_one_name_in_several_folders_are_told_apart(capture):

@@ -207,6 +207,33 @@ def test_a_division_without_terms_is_a_pinhole(tmp_path, room, bent):
         assert_same(read_scan(folder, OPTIONS), room)
 
 
+def test_the_model_none_is_a_pinhole_whatever_terms_stand_there(tmp_path, room):
+    """One of the program's own names, beside perspective."""
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)
+    for file in folder.rglob("*.xmp"):
+        text = file.read_text().replace("brown3", "none")
+        file.write_text(text.replace(">0 0 0 0 0 0<", ">-0.1 0 0 0 0 0<"))
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+
+
+def test_a_skew_is_refused(tmp_path, room):
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)
+    for file in folder.rglob("*.xmp"):
+        file.write_text(file.read_text().replace('Skew="0"', 'Skew="0.002"'))
+    with pytest.raises(InputRefused, match=r"a skew of 0\.002, which is not read.*camera\]$"):
+        read_scan(folder, OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("bent", "told"), [("-0.05,0,0,0,0,0", True), ("-0.05,0.01,0,0,0,0", False)]
+)
+def test_a_lens_of_k1_alone_is_told(tmp_path, room, bent, told):
+    """The table does not say whether it is that of Division, which bends the other way."""
+    folder = write_table(write_pictures(tmp_path / "scan", room), room, bent=bent)
+    warnings = read_scan(folder, OPTIONS).warnings
+    assert any("have k1 alone, as the model Division does" in said for said in warnings) == told
+
+
 def test_the_lens_is_a_polynomial_of_the_ray(tmp_path, room):
     folder = write_pictures(tmp_path / "scan", room)
     write_table(folder, room, bent="-0.1,0.06,-0.01,0.002,0.003,0.004")

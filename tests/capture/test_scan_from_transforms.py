@@ -47,6 +47,30 @@ def test_the_document_itself_can_be_named(capture):
     assert len(read_scan(capture.manifest, IngestOptions()).frames) == 12
 
 
+@pytest.mark.parametrize("mark", [{"from_mitsuba": True}, {"normal_mts_args": [1, 2]}])
+def test_cameras_that_instant_ngp_knows_as_mitsubas_look_the_other_way(capture, mark):
+    """x to the left, y up, z forward; they passed for OpenGL's."""
+    with edited(capture.manifest) as document:
+        document |= mark
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, [0, 2]] *= -1
+            frame["transform_matrix"] = pose.tolist()
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-12)
+
+
+@pytest.mark.parametrize("key", ["ftheta_p0", "equirectangular", "orthographic"])
+def test_lenses_of_instant_ngp_that_are_not_read_are_refused(capture, key):
+    """They passed for pinholes where an angle or a focal length stands beside them."""
+    with edited(capture.manifest) as document:
+        del document["camera_model"]
+        document[key] = 0.1
+    said = rf"has the camera model '{key}' \(known: PINHOLE.*\[capture\.camera\]$"
+    with pytest.raises(InputRefused, match=said):
+        read_scan(capture.folder, IngestOptions())
+
+
 @pytest.mark.parametrize("angle", [45, 80])
 def test_an_angle_in_degrees_is_no_other_angle(tmp_path, angle):
     """45 in radians has the tangent of an angle that a lens may have."""

@@ -94,12 +94,13 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
         copy_beside(beside, staged)
         rest = {**document, "frames": frames, "encoding": encoding}
         write_json(staged / "transforms.json", rest)
+    told = source if source.is_file() else capture
     photographs = sum(len(bracket.images) for bracket in brackets)
     alone = sum(map(len, unchecked.values()))
     if unchecked:
         name, files = next(iter(unchecked.items()))
         warn(
-            f"{source}: {alone} of {photographs} photographs, in {len(unchecked)} of "
+            f"{told}: {alone} of {photographs} photographs, in {len(unchecked)} of "
             f"{len(brackets)} brackets, share no clear code with the exposure next to theirs, so "
             f"that nothing tells whether the camera moved; they are merged as they are (first "
             f"{', '.join(files)} in {name}). Bracket in smaller steps, or use a tripod. "
@@ -108,7 +109,7 @@ def merge_brackets(capture: Path, folder: Path) -> dict[str, Any]:
     if flickers:
         file, factor = max(flickers, key=lambda one: abs(np.log(one[1])))
         warn(
-            f"{source}: {len(flickers)} of {photographs} photographs are all brighter or darker "
+            f"{told}: {len(flickers)} of {photographs} photographs are all brighter or darker "
             f"than their exposures say, {file} most of all ({factor:.2f} x), as a lamp's "
             "flicker or a fast shutter may make them; that factor has been taken out. With lamps "
             "in view take exposures of 1/50 s or longer, through a grey filter. [brackets.flicker]"

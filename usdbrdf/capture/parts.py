@@ -364,10 +364,11 @@ def scan_from_parts(
     rigid = rigid_records(records, findings, source, pose_scale=options.pose_scale)
     rigid = with_masks(at_image_size(rigid, findings, source), findings)
     photographs = frames_from_records(rigid, encoding=encoding, radiometric=radiometric)
+    findings.frames = photographs
     frames, views, photograph_of = frames_of_photographs(photographs, rigid)
     findings.refuse_too_few_frames(source, total, views=len(frames))
     geometry = read_geometry()
-    findings.frames, findings.geometry = photographs, geometry
+    findings.geometry = geometry
     if not any(r.lens.curve == "equirectangular" for r in rigid):
         refuse_without_parallax(frames, geometry.mesh, source)
     rays = RayScene(geometry.mesh.points, geometry.mesh.triangles)

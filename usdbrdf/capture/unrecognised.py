@@ -124,6 +124,15 @@ _PROGRAMS = (
         "ContextCapture", (".xmz",), (), _NOTHING,
         "Unzip it: it holds a BlocksExchange XML, which is read",
     ),
+    # Name, places in any coordinates and angles: all of its tables but the one that is read.
+    _Program(
+        "RealityScan", (), (), rb"(?mi)^#? *name *, *x[^,\n]*, *y[^,\n]*, *(?:z|alt)\b",
+        "Export 'Internal/External camera parameters' (CSV) instead, which has the lens too",
+    ),
+    _Program(
+        "Pix4D", (), (), rb"\A *imageName +X +Y +Z +Omega",
+        "Bring the project's 1_initial/params/*_calibrated_camera_parameters.txt",
+    ),
     _Program(
         "Metashape", (), (), rb"(?mi)^#.*\bomega\b.*\bphi\b.*\bkappa\b",
         "Export them as Agisoft XML (File > Export > Export Cameras), which has the lens too",
@@ -132,6 +141,38 @@ _PROGRAMS = (
         "Pix4D", (".p4d", "camera_parameters.txt", "camera_parameters.cam", "pmatrix.txt"), (),
         _NOTHING, "Bring the project's 1_initial/params/*_calibrated_camera_parameters.txt",
     ),
+    _Program(
+        "OpenDroneMap", ("shots.geojson",), (), _NOTHING,
+        "Bring opensfm/reconstruction.json of the project, and a mesh in its frame",
+    ),
+    _Program("MicMac", (), (), rb"<(?:ExportAPERO|OrientationConique)>", _ANEW),
+    _Program(
+        "ScanNet++'s telephone", ("pose_intrinsic_imu.json",), (), _NOTHING,
+        "Name the scene's folder, which holds dslr/ and scans/",
+    ),
+    _Program(
+        "Spectacular AI", ("data.jsonl",), (), _NOTHING,
+        "Make a transforms.json of them with its 'sai-cli process', and a mesh in its frame",
+    ),
+    # Along which it is rendered, or which its viewer has stored.
+    _Program(
+        "nerfstudio's renders", (), ("camera_path",), _NOTHING,
+        "Name the transforms.json of the photographs",
+    ),
+    _Program(
+        "Nerfies", (), (), rb'\A\s*\{(?=[^}]*"orientation")(?=[^}]*"pixel_aspect_ratio")', _BY_HAND,
+    ),
+    _Program("EasyMocap", ("extri.yml", "intri.yml"), (), _NOTHING, _BY_HAND),
+    # Rows of a time, a place and a quaternion, or of a matrix of 3 x 4.
+    _Program(
+        "ORB-SLAM", ("trajectory.txt",), (), _NOTHING,
+        f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+    ),
+    _Program(
+        "KITTI", (), (), rb"\A(?:[-+.\de]+ ){11}[-+.\de]+\r?\n",
+        f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)", "poses.txt",
+    ),
+    _Program("EuRoC", (), (), rb"\A#timestamp.*p_RS_R_x", f"{_BY_HAND}, and fuse a mesh (Open3D)"),
     _Program(
         "Stray Scanner", (), (), rb"\Atimestamp, *frame, *x, *y, *z, *qx",
         f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
@@ -167,9 +208,13 @@ _PROGRAMS = (
 
 
 def other_program(document: Path) -> str:
-    """Whose cameras a file holds that are not read, and how to have them read; else ""."""
+    """Whose cameras a file holds that are not read, and how to have them read, or that it has not
+    been fetched; else ""."""
+    from usdbrdf.files.paths import why_not_fetched
     from usdbrdf.files.tables import beginning_of
 
+    if (why := why_not_fetched(document)) is not None:
+        return f"{document.name} is {why}"
     head = beginning_of(document, _HEAD)
     for one in _PROGRAMS:
         if one.owns(document, head):

@@ -20,6 +20,7 @@ import numpy as np
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import write_text_atomic
+from usdbrdf.files.paths import why_not_fetched
 from usdbrdf.model.arrays import Array
 
 # Not msgspec: it keeps the last of two equal keys without a word, takes no NaN even where the
@@ -118,6 +119,8 @@ def read_text(path: Path) -> str:
                 f"{path}: {size} bytes, more than the limit of {MAX_BYTES}. Split the capture. "
                 "[document.size]"
             )
+        if (why := why_not_fetched(path)) is not None:
+            raise InputRefused(f"{path}: {why}. [document.pointer]")
         content = path.read_bytes()
         return content.decode(encoding_of_text(content))
     except OSError as error:

@@ -12,6 +12,8 @@ from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict
 
 _URI = re.compile(r"^(?:[a-z][a-z0-9+.\-]+://|(?:file|data):)", re.IGNORECASE)
 _ABSOLUTE = re.compile(r"^(?:[/\\~]|[A-Za-z]:[/\\])")  # POSIX, UNC, home, Windows drive
+# How what Git LFS leaves in the place of a file begins, and how long it may be.
+_POINTER, _LONGEST_POINTER = b"version https://git-lfs.github.com/spec/", 1024
 _LITTER = (".DS_Store", "._*", "Thumbs.db", "ehthumbs.db", "desktop.ini", ".directory", "*~")
 
 
@@ -90,7 +92,19 @@ def readable_size(image: Path) -> int | str:
         return "not a regular file. Name an image file"
     if not os.access(image, os.R_OK):
         return "permission denied. Make it readable"
-    return status.st_size
+    return why_not_fetched(image) or status.st_size
+
+
+def why_not_fetched(file: Path) -> str | None:
+    """Why a regular file is none of what its name says, and what to do, where it is what Git LFS
+    leaves in its place; else None."""
+    with suppress(OSError):
+        if file.stat().st_size <= _LONGEST_POINTER and file.read_bytes().startswith(_POINTER):
+            return (
+                "a pointer of Git LFS, not the file itself. Fetch it with 'git lfs pull', or "
+                "download it"
+            )
+    return None
 
 
 def refuse_lost_folder() -> None:

@@ -21,6 +21,7 @@ from usdbrdf.files.documents import (
     read_text,
     refusal_of_arrays,
 )
+from usdbrdf.files.paths import why_not_fetched
 from usdbrdf.model.arrays import Array, Double
 
 Element = ElementTree.Element
@@ -215,6 +216,8 @@ def read_array(path: Path) -> Array:
                 f"{path}: no regular file of up to {MAX_BYTES} bytes. Export it again. "
                 "[arrays.damaged]"
             )
+        if (why := why_not_fetched(path)) is not None:
+            raise InputRefused(f"{path}: {why}. [arrays.pointer]")
         # Mapped: a header may announce any size, and only what the file holds can be mapped.
         return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
     except DAMAGED_ARRAYS as error:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from usdbrdf.errors import InputRefused, MeshMissing, UsdBrdfError
+from usdbrdf.files.paths import why_not_fetched
 from usdbrdf.job.child import run_child
 from usdbrdf.job.memory import addresses_of_libraries, machine_bytes
 from usdbrdf.model.arrays import Array, Double, Float
@@ -127,7 +128,7 @@ def refuse_far(path: Path, points: Float | Double) -> None:
 
 
 def refuse_large(kind: str, path: Path) -> None:
-    """InputRefused unless this is a regular file within the kind's limit; nothing is opened."""
+    """InputRefused unless this is a regular file within the kind's limit, and the file itself."""
     if not os.path.isfile(path) or not os.access(path, os.R_OK):
         what = "cannot be read" if os.path.isfile(path) else "is not a regular file"
         what = what if os.path.exists(path) else "does not exist"
@@ -138,6 +139,8 @@ def refuse_large(kind: str, path: Path) -> None:
         raise InputRefused(
             f"{path}: {size} bytes, the limit of a {kind} is {limit}. Reduce it. [{kind}.size]"
         )
+    if (why := why_not_fetched(path)) is not None:
+        raise InputRefused(f"{path}: {why}. [{kind}.pointer]")
 
 
 def packed(value: object) -> dict[str, Array]:

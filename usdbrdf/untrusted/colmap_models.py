@@ -1,4 +1,5 @@
-"""COLMAP's models, text or binary, of any version, by COLMAP's own reader: cameras and poses."""
+"""COLMAP's models, text or binary, of any version: cameras and poses, by COLMAP's own reader, and
+the places of points."""
 
 from __future__ import annotations
 
@@ -67,6 +68,31 @@ def colmap_model(folder: Path) -> ColmapModel:
     return read_in_child(
         "model", f"{__name__}:read_here", files[1], ColmapModel, parts=(ColmapCamera,)
     )
+
+
+def colmap_points(folder: Path) -> Double:
+    """(N, 3) the points of the model in a folder; none where their file is not there."""
+    file = folder / f"points3D{next(iter(model_files(folder)), Path()).suffix}"
+    if not file.is_file():
+        return np.empty((0, 3))
+    return read_in_child("model", f"{__name__}:read_points_here", file, np.ndarray)
+
+
+def read_points_here(file: Path) -> Double:
+    """``colmap_points`` in this process, which is to be a child. What is cut off ends them."""
+    if file.suffix == ".txt":
+        with file.open(encoding="utf-8", errors="replace") as lines:
+            rows = [line.split(None, 4)[1:4] for line in lines if not line.startswith("#")]
+        numbers = [row for row in rows if len(row) == 3 and all(map(_NUMBER.fullmatch, row))]
+        return np.array(numbers, np.float64).reshape(-1, 3)
+    content, at, points = file.read_bytes(), 8, []
+    # Number, place, colour, error, and 8 bytes for each image that shows it.
+    layout = struct.Struct("<Q3d3BdQ")
+    while at + layout.size <= len(content):
+        _, x, y, z, *_, shown = layout.unpack_from(content, at)
+        points.append((x, y, z))
+        at += layout.size + 8 * shown
+    return np.array(points, np.float64).reshape(-1, 3)
 
 
 def read_here(images: Path) -> ColmapModel:

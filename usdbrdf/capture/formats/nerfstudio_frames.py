@@ -22,6 +22,7 @@ import numpy as np
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.colmap import world_from_camera
 from usdbrdf.capture.formats.named_pictures import rigid_pose
+from usdbrdf.capture.mesh_frames import lies_with_points
 from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.documents import read_json
@@ -30,6 +31,7 @@ from usdbrdf.model.arrays import Double
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import colmap_model, model_files
+from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 FILE = "dataparser_transforms.json"
@@ -47,6 +49,9 @@ _LARGEST = 1e9  # number that makes sense in a matrix
 # By which instant-ngp's meshes are known, PLY and OBJ; what it takes where a document says nothing.
 _OF_NGP = (b"output from https://github.com/NVlabs/instant-ngp", b"mtllib nerf.mtl")
 _NGP_SCALE, _NGP_OFFSET = 0.33, 0.5
+# Lenses that it has by a key: the longitudes and latitudes of a whole sphere, their equal-area
+# cylinder, none, and a polynomial of the pixels' distance.
+_NGP_LENSES = ("latlong", "equirectangular", "orthographic", "ftheta_p0")
 _NGP_AXES = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
@@ -83,6 +88,26 @@ def stated_pose(matrix: object) -> Double | None:
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0.0, 0, 0, 1]])
     return pose if pose.shape == (4, 4) and (np.abs(pose) <= LARGEST_OF_POSE).all() else None
+
+
+def rolling_shutter(holder: Mapping[str, Any]) -> list[Any]:
+    """What instant-ngp's rolling_shutter says, times of which each is 0 where there is none."""
+    stated = holder.get("rolling_shutter")
+    return stated if isinstance(stated, list) else [stated]
+
+
+def lens_key(said: Mapping[str, Any]) -> str:
+    """The camera_model that is meant by one of instant-ngp's keys for its lenses (read_lens); the
+    key itself where no model that is known is; "" where there is none."""
+    key = next((key for key in _NGP_LENSES if said.get(key) not in (None, False)), "")
+    return "EQUIRECTANGULAR" if key == "latlong" else key
+
+
+def camera_axes(document: Mapping[str, Any]) -> Double:
+    """(4, 4) by which the document's cameras become OpenGL's: those that instant-ngp knows as
+    Mitsuba's have x to the left and look down +z (nerf_matrix_to_ngp)."""
+    is_mitsuba = document.get("from_mitsuba", "normal_mts_args" in document)
+    return np.diag([-1.0, 1, -1, 1]) if is_mitsuba is True else np.eye(4)
 
 
 def rigid_matrix(stated: object) -> Double | None:
@@ -126,15 +151,11 @@ def geometry_at_home(
         )
         home = np.linalg.inv(applied.similarity) @ _document_from_ngp(mesh, document)
         return _moved(read, np.asarray(home, np.float64), options, meters_per_unit)
-    if mesh.name in _COLMAPS and (found := _capture_from_colmap(mesh, folder, findings)):
-        model, moved = found
-        findings.warn(
-            f"{mesh.name}: is called as COLMAP's meshes, which lie in the frame of its model "
-            f"{model.relative_to(folder).as_posix()}; it is brought to that of the poses, by the "
-            "cameras of both. Rename it if it lies there already. [mesh.frame]"
-        )
-        return _moved(read, moved, options, meters_per_unit)
     statements = statements_beside(mesh)
+    if mesh.suffix.lower() in MESH_SUFFIXES and (mesh.name in _COLMAPS or not statements):
+        known = _home_of_colmaps(mesh, folder, findings, applied)
+        if known is not None:
+            return _moved(read, known, options, meters_per_unit)
     if statements and mesh.suffix.lower() in USD_SUFFIXES:
         raise InputRefused(
             f"{mesh}: {FILE} beside it says that it lies in the frame that nerfstudio trained in, "
@@ -203,17 +224,61 @@ def _trained_from_capture(statement: Path, applied: Applied) -> Double:
     return np.asarray(trained @ inner @ applied.similarity, np.float64)
 
 
+def _home_of_colmaps(
+    mesh: Path, folder: Path, findings: Findings, applied: Applied
+) -> Double | None:
+    """The similarity (4, 4) to the capture's frame of a mesh beside a model of COLMAP: from the
+    model's if it lies as the points of that do, none if it lies where the cameras take these. Where
+    they do not tell, its name does; None where that does not either. Of a model in the capture's
+    frame: from the document's, if it lies where what was applied takes the points."""
+    of_colmap = mesh.name in _COLMAPS
+    found = _capture_from_colmap(mesh, folder, findings, tells=of_colmap)
+    if found is None:
+        return None
+    model, moved = found
+    name = model.relative_to(folder).as_posix()
+    if np.abs(moved - np.eye(4)).max() < _SAME_FRAME:
+        stored = applied.similarity
+        is_same = np.abs(stored - np.eye(4)).max() < _SAME_FRAME
+        if is_same or lies_with_points(mesh, model, stored) is not False:
+            return None
+        findings.warn(
+            f"{mesh.name}: lies in the frame of the document's poses, by the points of the model "
+            f"{name}, and applied_transform is undone of it as it is of these. [mesh.frame]"
+        )
+        return np.asarray(np.linalg.inv(stored), np.float64)
+    lies = lies_with_points(mesh, model, moved)
+    if lies is False:
+        if of_colmap:
+            findings.warn(
+                f"{mesh.name}: is called as COLMAP's meshes, but lies in the frame of the poses "
+                f"already, by the points of the model {name}; it stays there. [mesh.frame]"
+            )
+        return np.eye(4)
+    if lies is None and not of_colmap:
+        return None
+    how = "lies" if lies else "is called as COLMAP's meshes, which lie"
+    doubt = "" if lies else " Rename it if it lies there already."
+    findings.warn(
+        f"{mesh.name}: {how} in the frame of COLMAP's model {name}; it is brought to that of the "
+        f"poses, by the cameras of both.{doubt} [mesh.frame]"
+    )
+    return moved
+
+
 def _capture_from_colmap(
-    mesh: Path, folder: Path, findings: Findings
+    mesh: Path, folder: Path, findings: Findings, *, tells: bool
 ) -> tuple[Path, Double] | None:
     """The model of COLMAP beside a document, and the similarity (4, 4) from its frame to the
-    capture's; None where there is none, the frame is the same, or, which is told, nobody knows as
-    it has not the same cameras."""
+    capture's; None where there is none, or nobody knows as it has not the same cameras, which is
+    told if it ``tells``."""
     models, frames = _models_beside(folder), findings.frames
     if not models or frames is None:
         return None
 
     def unknown(why: str) -> None:
+        if not tells:
+            return
         findings.warn(
             f"{mesh.name}: is called as COLMAP's meshes, but whether it lies in another frame than "
             f"the poses is not known, as {why}. [mesh.frame]"
@@ -249,8 +314,7 @@ def _capture_from_colmap(
     if max(np.abs(turns - turn).max(), off.max() / spread) > _SAME_CAMERA:
         unknown(others)
         return None
-    moved = rigid_pose(scale * turn, centre - scale * from_centre)
-    return None if np.abs(moved - np.eye(4)).max() < _SAME_FRAME else (models[0], moved)
+    return models[0], rigid_pose(scale * turn, centre - scale * from_centre)
 
 
 def _by_ends(names: Sequence[str]) -> dict[tuple[str, ...], int | None]:

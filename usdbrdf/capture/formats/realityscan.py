@@ -11,7 +11,7 @@ OpenCV's axes, and the camera's position.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -56,6 +56,8 @@ _NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 _DESCRIBED = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
 _COLUMNS = frozenset(("name", "x", "y", "alt"))
 _FULL_FRAME_MM = 36.0
+# Models without terms; what is read as one of Brown's is called so, brown3t2 for example.
+_NO_TERMS = ("none", "perspective")
 _EXPORT = 'Export the registration as "Internal/External camera parameters"'
 
 
@@ -102,6 +104,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     refuse_without_pictures(pictures, source)
     if tables:
         records = list(records_of_table(source, pictures, findings))
+        _warn_of_division(records, findings, source)
     else:
         records = list(records_of_sidecars(sidecars, pictures, findings))
     records = [
@@ -142,6 +145,20 @@ def records_of_table(source: Path, pictures: Pictures, findings: Findings) -> It
         yield from _record(name, pictures.named(name), pose, focal, centre, terms, findings)
 
 
+def _warn_of_division(records: Sequence[FrameRecord], findings: Findings, source: Path) -> None:
+    """One sentence where lenses have k1 alone. The table does not name their model, and only
+    Division has no further term; its k1 bends the other way than Brown's."""
+    alone = [
+        r for r in records if r.lens.bends and not any((*r.lens.radial[1:], *r.lens.tangential))
+    ]
+    if alone:
+        findings.warn(
+            f"{source.name}: {len(alone)} cameras have k1 alone, as the model Division does; it is "
+            "taken for Brown's. If it is not, choose Brown3 in the alignment's settings, and "
+            "export again. [capture.camera]"
+        )
+
+
 def _axes(heading: float, pitch: float, roll: float) -> Double:
     """(3, 3) world (x east, y north, z up) from camera, OpenGL's axes, of angles in degrees."""
     turns = np.radians([-heading, pitch, roll])
@@ -163,13 +180,18 @@ def records_of_sidecars(
         rotation, place = _numbers(said, "Rotation", 9), _numbers(said, "Position", 3)
         focal = number_in(said, "FocalLength35mm")
         model, terms = said.get("DistortionModel", "perspective"), _terms(said)
-        if not (model == "perspective" or model.startswith("brown")) and (
+        if not (model in _NO_TERMS or model.startswith("brown")) and (
             # Of the usual model without terms it is a pinhole.
             model != "division" or not _is_without_terms(said)
         ):
             raise InputRefused(
                 f"{file}: the lens model {model!r} is not read. Choose Brown in the alignment's "
                 "settings, and export again. [capture.camera]"
+            )
+        if number_in(said, "Skew"):
+            raise InputRefused(
+                f"{file}: its lens has a skew of {said['Skew'][:40]}, which is not read. Set it to "
+                "0 in the alignment's settings, and export again. [capture.camera]"
             )
         if said.get("Coordinates", "absolute") != "absolute":
             raise InputRefused(
@@ -183,7 +205,7 @@ def records_of_sidecars(
             continue
         centre = [number_in(said, f"PrincipalPoint{axis}") or 0.0 for axis in "UV"]
         pose = opengl_from_opencv(rigid_pose(rotation.reshape(3, 3).T, place))
-        bent = terms if model != "perspective" else [0.0] * 6
+        bent = terms if model not in _NO_TERMS else [0.0] * 6
         squeeze = number_in(said, "AspectRatio") or 1.0
         yield from _record(name, image, pose, focal, centre, bent, findings, squeeze)
 

@@ -18,8 +18,11 @@ from usdbrdf.capture.formats.named_pictures import Pictured, mesh_beside, path_i
 from usdbrdf.capture.formats.nerfstudio_frames import (
     EXPORTED,
     Applied,
+    camera_axes,
     geometry_at_home,
+    lens_key,
     rigid_matrix,
+    rolling_shutter,
     stated_pose,
     statements_beside,
 )
@@ -240,7 +243,7 @@ def _captured(
         images=images,
         is_legacy=legacy,
     )
-    if any(any(_shutter(frame)) for frame in (document, *frames)):
+    if any(any(rolling_shutter(frame)) for frame in (document, *frames)):
         findings.warn(
             f"{source.name}: states a rolling_shutter, which is not undone: what a camera took "
             "while it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
@@ -301,7 +304,7 @@ def _record(
     return FrameRecord(
         name=name,
         image_path=path,
-        world_from_camera=capture.applied.undone(pose),
+        world_from_camera=capture.applied.undone(pose @ camera_axes(capture.document)),
         captured_pose=_captured_pose(capture, frame, name),
         intrinsics=_intrinsics(capture, frame, name, lens, width, height),
         resolution=(width, height),
@@ -324,7 +327,7 @@ def _captured_pose(capture: _Capture, frame: Mapping[str, Any], name: str) -> Do
             "and sensible numbers. Correct or remove it.",
             "capture.pose",
         )
-    return None if pose is None else capture.applied.undone(pose)
+    return None if pose is None else capture.applied.undone(pose @ camera_axes(capture.document))
 
 
 def _intrinsics(
@@ -399,12 +402,6 @@ def _why_unlike(
     )
 
 
-def _shutter(holder: Mapping[str, Any]) -> list[Any]:
-    """What instant-ngp's rolling_shutter says, times of which each is 0 where there is none."""
-    stated = holder.get("rolling_shutter")
-    return stated if isinstance(stated, list) else [stated]
-
-
 def _lens(capture: _Capture, frame: Mapping[str, Any], name: str) -> Lens:
     """What camera_model, or instant-ngp's is_fisheye, and the distortion of a frame, else of the
     document, say.
@@ -413,12 +410,14 @@ def _lens(capture: _Capture, frame: Mapping[str, Any], name: str) -> Lens:
     them, k4 to k6 are OpenCV's, which divide.
     """
     fisheye = frame.get("is_fisheye", capture.document.get("is_fisheye"))
-    usual = "OPENCV_FISHEYE" if fisheye is True else "PINHOLE"
+    usual = lens_key({**capture.document, **frame})
+    usual = usual or ("OPENCV_FISHEYE" if fisheye is True else "PINHOLE")
     stated = frame.get("camera_model", capture.document.get("camera_model"))
     model = usual if stated is None else stated.upper() if isinstance(stated, str) else stated
     if not isinstance(model, str) or model not in _CURVES:
         raise capture.refuse(
-            f"the frame {name!r} has the camera model {stated!r} (known: {', '.join(_CURVES)}). "
+            f"the frame {name!r} has the camera model {(usual if stated is None else stated)!r} "
+            f"(known: {', '.join(_CURVES)}). "
             "Undistort the images to a pinhole camera first.",
             "capture.camera",
         )

@@ -1,0 +1,56 @@
+"""In which of two frames a mesh lies: where the points lie on it that its photographs share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from usdbrdf.model.arrays import Double
+from usdbrdf.untrusted.colmap_models import colmap_points
+from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
+
+# Places on the mesh and points that are compared; fewer points say nothing.
+_PLACES, _MOST_POINTS, _FEWEST_POINTS = 100_000, 20_000, 30
+# Half of the points lie nearer to their mesh than this, in parts of their spread, and farther from
+# one of another frame by this factor.
+_ON_IT, _CLEARLY = 0.1, 3.0
+
+
+def lies_with_points(mesh: Path, model: Path, moved: Double) -> bool | None:
+    """Whether a mesh lies where the points of a COLMAP model lie (True), or where ``moved``, a
+    similarity (4, 4), takes them (False); None where they do not tell, or are not there."""
+    points = colmap_points(model)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < _FEWEST_POINTS:
+        return None
+    points = points[:: -(-len(points) // _MOST_POINTS)]
+    surface = cKDTree(_places_on(mesh_from_file(mesh)))
+    here = _off(surface, points)
+    there = _off(surface, points @ moved[:3, :3].T + moved[:3, 3])
+    if min(here, there) > _ON_IT or max(here, there) < _CLEARLY * min(here, there):
+        return None
+    return here < there
+
+
+def _off(surface: cKDTree, points: Double) -> float:
+    """How far half of the points lie off a surface, in parts of their own spread."""
+    distance, _ = surface.query(points)
+    spread = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+    return float(np.median(distance) / max(float(spread), np.finfo(np.float64).tiny))
+
+
+def _places_on(mesh: FileMesh) -> Double:
+    """Corners and places evenly over all faces: large ones have few corners."""
+    corners = mesh.points[mesh.triangles].astype(np.float64)
+    a, b, c = np.moveaxis(corners, 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    before = np.concatenate([[0.0], np.cumsum(area)])
+    chance = np.random.default_rng(0)
+    where = chance.uniform(0, before[-1], _PLACES)
+    face = np.clip(np.searchsorted(before, where, side="right") - 1, 0, len(area) - 1)
+    u, v = chance.uniform(size=(2, _PLACES, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    within = a[face] + u * (b - a)[face] + v * (c - a)[face]
+    return np.concatenate([within, mesh.points[np.unique(mesh.triangles)].astype(np.float64)])
