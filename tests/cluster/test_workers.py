@@ -261,6 +261,20 @@ def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
     assert len(tries) == 3
 
 
+def test_workers_are_begun_anew_where_their_nannies_gave_up() -> None:
+    """As they do where workers die again while they start."""
+    with workers_of(ClusterOptions(workers=1)) as workers:
+        assert isinstance(workers, _Session)
+        engine = workers._started()
+        cluster = engine._client.cluster
+        (nanny,) = cluster.workers.values()
+        cluster.sync(nanny.close)
+        assert not engine._client.nthreads()
+        assert engine.elsewhere() == 1
+        assert len(workers_on_this_machine()) == 1
+    assert not workers_on_this_machine()
+
+
 def test_workers_of_two_kinds_exclude_each_other() -> None:
     with pytest.raises(UsageError, match="exclude each other"):
         ClusterOptions(workers=2, scheduler="tcp://127.0.0.1:8786")

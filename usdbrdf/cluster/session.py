@@ -6,6 +6,7 @@ import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,9 @@ _UNWATCHED = {
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "10s",
 }
+# In which a worker that died is to be back before it is given up: a busy machine takes long to
+# start one, and who begins anew all the time never ends.
+_PATIENT = {"distributed.deploy.lost-worker-timeout": "60s"}
 # Of a terminal's Ctrl-C, which all its processes get, this one tells and ends the others.
 _DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
@@ -69,7 +73,12 @@ class _Session:
 
             options = self._options
             client = self._client or self._stack.enter_context(_client(options))
-            self._workers = engine.DaskWorkers(client, options.shared_folder, options.unit_limit)
+            given = client, options.shared_folder, options.unit_limit
+            if self._client is None and options.workers:
+                renew = partial(_renew, client.cluster, options.workers)
+                self._workers = engine.DaskWorkers(*given, renew)
+            else:
+                self._workers = engine.DaskWorkers(*given)
         return self._workers
 
     def forget(self, folder: Path) -> None:
@@ -119,7 +128,10 @@ def _local_cluster(count: int) -> Iterator[Any]:
     """So many worker processes, whose threads are this machine's cores shared out. Nobody else can
     reach them: they listen on this machine alone, and to who holds this session's certificate."""
     threads = str(max(1, (os.cpu_count() or 1) // count))
-    with _started(count, {"NUMBA_NUM_THREADS": threads}) as cluster:
+    from dask import config
+
+    given = {"NUMBA_NUM_THREADS": threads}
+    with config.set(_PATIENT), _started(count, given) as cluster:
         say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
         yield cluster
 
@@ -151,6 +163,20 @@ def _started(count: int, environment: Mapping[str, str]) -> Any:
                     "command again, with fewer if memory is short. [cluster.workers]"
                 ) from error
     raise AssertionError  # not reached
+
+
+def _renew(cluster: Any, count: int) -> None:
+    """Start workers in the place of those whose nanny is gone: it ends where they die while they
+    start, and Dask ends it where they take too long to come back."""
+    from distributed.core import Status
+
+    async def renew() -> None:
+        for name, nanny in [*cluster.workers.items()]:
+            if nanny.status in (Status.closed, Status.failed):
+                del cluster.workers[name]
+        cluster.scale(count)
+
+    cluster.sync(renew)
 
 
 def _say_dashboard(client: Client) -> None:
