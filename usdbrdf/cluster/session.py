@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
+import signal
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 
 # Seconds in which a scheduler answers.
 _ANSWER = 20.0
+# What Dask raises where it takes longer.
+_LATE = (TimeoutError, asyncio.TimeoutError)
 # Dask looks at every thread's stack a hundred times a second, which takes time from the work.
 _UNWATCHED = {
     "distributed.worker.profile.enabled": False,
@@ -104,23 +108,24 @@ def _client(options: ClusterOptions) -> Iterator[Client]:
     # What it logs of deaths and lost connections is told in our words.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    if options.scheduler is None:
-        with _local_cluster(options.workers or 1) as cluster, Client(cluster) as client:
+    with ExitStack() as stack:
+        if options.scheduler is None:
+            client = Client(stack.enter_context(_local_cluster(options.workers or 1)))
+        else:
+            try:
+                client = Client(options.scheduler, timeout=_ANSWER)
+            except (OSError, ValueError) as error:
+                raise EnvironmentFailure(
+                    f"--scheduler {options.scheduler}: no scheduler answers ({error}). Check the "
+                    "address, and for tls:// the certificates in Dask's configuration. "
+                    "[cluster.scheduler]"
+                ) from error
+        try:
             _say_dashboard(client)
             yield client
-        return
-    try:
-        client = Client(options.scheduler, timeout=_ANSWER)
-    except (OSError, ValueError) as error:
-        raise EnvironmentFailure(
-            f"--scheduler {options.scheduler}: no scheduler answers ({error}). Check the address, "
-            "and for tls:// the certificates in Dask's configuration. [cluster.scheduler]"
-        ) from error
-    try:
-        _say_dashboard(client)
-        yield client
-    finally:
-        client.close(timeout=_ANSWER)
+        finally:
+            with suppress(*_LATE):
+                client.close(timeout=_ANSWER)
 
 
 @contextmanager
@@ -131,9 +136,25 @@ def _local_cluster(count: int) -> Iterator[Any]:
     from dask import config
 
     given = {"NUMBA_NUM_THREADS": threads}
-    with config.set(_PATIENT), _started(count, given) as cluster:
-        say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
-        yield cluster
+    with config.set(_PATIENT):
+        cluster = _started(count, given)
+        try:
+            say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
+            yield cluster
+        finally:
+            _end(cluster)
+
+
+def _end(cluster: Any) -> None:
+    """However long a busy machine takes, which is no failure of what was done or is told: workers
+    that do not end by then are killed."""
+    nannies = [*cluster.workers.values()]
+    with suppress(*_LATE):
+        cluster.close(timeout=_ANSWER)
+        return
+    for pid in filter(None, [nanny.pid for nanny in nannies]):
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def _started(count: int, environment: Mapping[str, str]) -> Any:
