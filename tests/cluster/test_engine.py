@@ -66,6 +66,23 @@ def test_units_that_find_the_same_are_done_once_each(
     assert not list((tmp_path / "shared").glob("*.npz"))
 
 
+def test_workers_use_freed_memory_again(
+    client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nannies tell them not to, which costs a quarter of a conversion."""
+    from usdbrdf.cluster import unit as module
+
+    kept = Event()
+    monkeypatch.setattr(module, "keep_freed", kept.set)
+
+    def unit(shared: None, piece: int) -> dict[str, Array]:
+        return {"kept": np.array(kept.is_set())}
+
+    with workers_of(client=client) as workers:
+        ((_, found),) = workers.results(as_ours(unit), None, {"0": 0}, tmp_path / "shared", 1)
+    assert found["kept"]
+
+
 def test_a_worker_that_hangs_without_a_nanny_is_dropped(
     client: Any, as_ours: Callable[[Any], Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -259,6 +260,47 @@ def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
     ):
         pass
     assert len(tries) == 3
+
+
+def test_workers_are_begun_anew_where_their_nannies_gave_up() -> None:
+    """As they do where workers die again while they start."""
+    with workers_of(ClusterOptions(workers=1)) as workers:
+        assert isinstance(workers, _Session)
+        engine = workers._started()
+        cluster = engine._client.cluster
+        (nanny,) = cluster.workers.values()
+        cluster.sync(nanny.close)
+        assert not engine._client.nthreads()
+        assert engine.elsewhere() == 1
+        assert len(workers_on_this_machine()) == 1
+    assert not workers_on_this_machine()
+
+
+def test_workers_that_do_not_end_in_time_are_killed_and_hide_no_other_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As on a busy machine, where a run that was interrupted ended as a defect of ours."""
+    from distributed import LocalCluster
+
+    def late(self: Any, timeout: float | None = None) -> None:
+        raise TimeoutError
+
+    close, begun = LocalCluster.close, list[Any]()
+
+    def interrupted() -> None:
+        with workers_of(ClusterOptions(workers=1)) as workers:
+            assert isinstance(workers, _Session)
+            begun.extend([workers._started()._client.cluster, *workers_on_this_machine()])
+            monkeypatch.setattr(LocalCluster, "close", late)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    monkeypatch.undo()
+    cluster, pid = begun
+    with suppress(psutil.NoSuchProcess):
+        psutil.Process(pid).wait(10)
+    close(cluster)
 
 
 def test_workers_of_two_kinds_exclude_each_other() -> None:

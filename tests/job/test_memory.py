@@ -74,6 +74,26 @@ def test_freed_memory_goes_back():
     assert len(last) == 60_000
 
 
+def test_freed_memory_is_used_again_where_dask_has_set_that_it_goes_back():
+    code = (
+        "import resource, sys; from usdbrdf.job.memory import keep_freed\n"
+        "if sys.argv[1:]: keep_freed()\n"
+        "def faults(): return resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "before = faults()\n"
+        "for _ in range(100): b'1' * 1_000_000\n"
+        "print(faults() - before)"
+    )
+    given = {**os.environ, "MALLOC_TRIM_THRESHOLD_": "65536"}
+    given["PYTHONPATH"] = str(Path(__file__).parents[2])
+    told = [
+        int(subprocess.check_output([sys.executable, "-c", code, *chosen], env=given))
+        for chosen in ([], ["keep"])
+    ]
+    if told[0] < 20_000:
+        pytest.skip("this C library does otherwise")
+    assert told[1] < 2_000
+
+
 def test_a_shell_that_leaves_no_addresses_is_told_in_a_sentence(tmp_path):
     """Libraries crash where they get none; the command line says so before it loads them."""
     code = (

@@ -35,6 +35,8 @@ T = TypeVar("T")
 # name comes from a worker; in which one says what it does; and in which one that hangs is to be
 # gone.
 _LOOK, _NO_WORKERS, _NAME, _SAYING, _STOPPING = 1.0, 120.0, 60.0, 5.0, 30.0
+# Seconds between tries to have workers where there are none.
+_ANEW = 5.0
 # How often a unit may fail with its worker, or for what a machine lacks, until that is believed.
 _TRIES = 5
 # What calls of a client raise where time runs out, and where the scheduler is gone.
@@ -55,12 +57,17 @@ class DaskWorkers:
     """Does units of work on the workers of a Dask cluster."""
 
     def __init__(
-        self, client: Client, shared_folder: Path | str | None, unit_limit_s: float
+        self,
+        client: Client,
+        shared_folder: Path | str | None,
+        unit_limit_s: float,
+        renew: Callable[[], object] = lambda: None,
     ) -> None:
         """shared_folder: which all workers see under this name, or the URL of an object store;
         None: the task's own, in the asset. unit_limit_s: seconds after which a worker is taken to
-        hang at a unit."""
+        hang at a unit. renew: starts workers in the place of those that are gone for good."""
         self._client, self._shared, self._limit = client, shared_folder, unit_limit_s
+        self._renew, self._hung = renew, 0
         self._stores: dict[str, Store] = {}
         self._address = str(client.scheduler.address)
         # What of ours each worker had to do at the last look, and since when none came back.
@@ -138,17 +145,20 @@ class DaskWorkers:
 
     def _at_once(self) -> int:
         """How many units can be worked on; waits for workers if there are none."""
-        threads = self._asked(self._client.nthreads)
-        if not threads:
+        end = time.monotonic() + _NO_WORKERS
+        while not (threads := self._asked(self._client.nthreads)):
+            self._renew()
+            left = end - time.monotonic()
             try:
-                self._client.wait_for_workers(1, timeout=_NO_WORKERS)
+                self._client.wait_for_workers(1, timeout=max(0.0, min(left, _ANEW)))
             except (*_LATE, *_GONE) as error:
+                if isinstance(error, _LATE) and left > _ANEW:
+                    continue
                 raise EnvironmentFailure(
                     f"{self._address}: no worker came in {_NO_WORKERS:.0f} s. Start some for this "
                     "scheduler, then run the same command again; finished work is kept. "
                     "[cluster.workers]"
                 ) from error
-            threads = self._asked(self._client.nthreads)
         return sum(threads.values())
 
     def _name(self, future: Future, files: Files) -> str:
@@ -158,9 +168,10 @@ class DaskWorkers:
         error = future.exception()
         if isinstance(error, KilledWorker):
             worker = getattr(error.last_worker, "address", "unknown")
+            hung = f", and allow more with --unit-limit: {self._hung} were restarted by that"
             raise EnvironmentFailure(
                 f"{self._address}: workers died at a unit of work, the last was {worker}. See "
-                "whether their memory suffices. [cluster.died]"
+                f"whether their memory suffices{hung if self._hung else ''}. [cluster.died]"
             ) from error
         if isinstance(error, ImportError | AttributeError):
             raise Stranger(
@@ -193,6 +204,7 @@ class DaskWorkers:
         if self._client.status != "running":
             raise self._gone()
         self._at_once()
+        self._renew()
         found = self._asked(self._client.processing)
         ours = {future.key: sent for future, sent in out.items()}
         now, before = time.monotonic(), self._at_work
@@ -233,6 +245,7 @@ class DaskWorkers:
             f"{worker}: this worker is at its unit of work for over {self._limit:g} s. It is "
             "restarted, or dropped where it has no nanny, and others do its work. [cluster.hangs]"
         )
+        self._hung += 1
         self._restart(worker)
         del self._at_work[worker]
 

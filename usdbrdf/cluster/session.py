@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
+import signal
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,12 +26,17 @@ if TYPE_CHECKING:
 
 # Seconds in which a scheduler answers.
 _ANSWER = 20.0
+# What Dask raises where it takes longer.
+_LATE = (TimeoutError, asyncio.TimeoutError)
 # Dask looks at every thread's stack a hundred times a second, which takes time from the work.
 _UNWATCHED = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "10s",
 }
+# In which a worker that died is to be back before it is given up: a busy machine takes long to
+# start one, and who begins anew all the time never ends.
+_PATIENT = {"distributed.deploy.lost-worker-timeout": "60s"}
 # Of a terminal's Ctrl-C, which all its processes get, this one tells and ends the others.
 _DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
@@ -69,7 +77,12 @@ class _Session:
 
             options = self._options
             client = self._client or self._stack.enter_context(_client(options))
-            self._workers = engine.DaskWorkers(client, options.shared_folder, options.unit_limit)
+            given = client, options.shared_folder, options.unit_limit
+            if self._client is None and options.workers:
+                renew = partial(_renew, client.cluster, options.workers)
+                self._workers = engine.DaskWorkers(*given, renew)
+            else:
+                self._workers = engine.DaskWorkers(*given)
         return self._workers
 
     def forget(self, folder: Path) -> None:
@@ -95,23 +108,24 @@ def _client(options: ClusterOptions) -> Iterator[Client]:
     # What it logs of deaths and lost connections is told in our words.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    if options.scheduler is None:
-        with _local_cluster(options.workers or 1) as cluster, Client(cluster) as client:
+    with ExitStack() as stack:
+        if options.scheduler is None:
+            client = Client(stack.enter_context(_local_cluster(options.workers or 1)))
+        else:
+            try:
+                client = Client(options.scheduler, timeout=_ANSWER)
+            except (OSError, ValueError) as error:
+                raise EnvironmentFailure(
+                    f"--scheduler {options.scheduler}: no scheduler answers ({error}). Check the "
+                    "address, and for tls:// the certificates in Dask's configuration. "
+                    "[cluster.scheduler]"
+                ) from error
+        try:
             _say_dashboard(client)
             yield client
-        return
-    try:
-        client = Client(options.scheduler, timeout=_ANSWER)
-    except (OSError, ValueError) as error:
-        raise EnvironmentFailure(
-            f"--scheduler {options.scheduler}: no scheduler answers ({error}). Check the address, "
-            "and for tls:// the certificates in Dask's configuration. [cluster.scheduler]"
-        ) from error
-    try:
-        _say_dashboard(client)
-        yield client
-    finally:
-        client.close(timeout=_ANSWER)
+        finally:
+            with suppress(*_LATE):
+                client.close(timeout=_ANSWER)
 
 
 @contextmanager
@@ -119,9 +133,28 @@ def _local_cluster(count: int) -> Iterator[Any]:
     """So many worker processes, whose threads are this machine's cores shared out. Nobody else can
     reach them: they listen on this machine alone, and to who holds this session's certificate."""
     threads = str(max(1, (os.cpu_count() or 1) // count))
-    with _started(count, {"NUMBA_NUM_THREADS": threads}) as cluster:
-        say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
-        yield cluster
+    from dask import config
+
+    given = {"NUMBA_NUM_THREADS": threads}
+    with config.set(_PATIENT):
+        cluster = _started(count, given)
+        try:
+            say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
+            yield cluster
+        finally:
+            _end(cluster)
+
+
+def _end(cluster: Any) -> None:
+    """However long a busy machine takes, which is no failure of what was done or is told: workers
+    that do not end by then are killed."""
+    nannies = [*cluster.workers.values()]
+    with suppress(*_LATE):
+        cluster.close(timeout=_ANSWER)
+        return
+    for pid in filter(None, [nanny.pid for nanny in nannies]):
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def _started(count: int, environment: Mapping[str, str]) -> Any:
@@ -151,6 +184,20 @@ def _started(count: int, environment: Mapping[str, str]) -> Any:
                     "command again, with fewer if memory is short. [cluster.workers]"
                 ) from error
     raise AssertionError  # not reached
+
+
+def _renew(cluster: Any, count: int) -> None:
+    """Start workers in the place of those whose nanny is gone: it ends where they die while they
+    start, and Dask ends it where they take too long to come back."""
+    from distributed.core import Status
+
+    async def renew() -> None:
+        for name, nanny in [*cluster.workers.items()]:
+            if nanny.status in (Status.closed, Status.failed):
+                del cluster.workers[name]
+        cluster.scale(count)
+
+    cluster.sync(renew)
 
 
 def _say_dashboard(client: Client) -> None:

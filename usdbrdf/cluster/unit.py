@@ -18,6 +18,7 @@ from usdbrdf.cluster.object_store import files_at
 from usdbrdf.cluster.store import Store
 from usdbrdf.errors import EnvironmentFailure, ImageRefused
 from usdbrdf.job.arithmetic import arithmetic
+from usdbrdf.job.memory import give_back_freed, keep_freed
 
 # What a worker keeps for its next units: of tasks that are done nothing is needed any more, and of
 # their scenes, which cost most, seldom more than one.
@@ -71,6 +72,7 @@ def _refuse_to_differ(wanted: Mapping[str, str]) -> None:
 def done(address: str, work: str, piece: Document) -> str:
     """Do a unit: the name of what it found in the store at ``address``, where ``work`` is the name
     of what all units of its kind share."""
+    keep_freed()
     store: Store = _stores.get(address, lambda: Store(files_at(address, _copies(address))))
 
     def value(document: Document) -> Any:
@@ -80,6 +82,7 @@ def done(address: str, work: str, piece: Document) -> str:
     def read() -> Any:
         told = store.document(work)
         _refuse_to_differ(told["arithmetic"])
+        give_back_freed()  # by the units of another kind, which are done
         return value(told["unit"]), value(told["shared"])
 
     unit, shared = _shared.get(f"{address}/{work}", read)

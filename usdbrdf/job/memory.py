@@ -16,6 +16,11 @@ GIB = 1 << 30
 # What libraries take of addresses before any work, and each thread with its stack and arena. With
 # less they crash instead of raising a MemoryError.
 _ADDRESSES, _ADDRESSES_OF_CORE = 5 * GIB // 2, 150 << 20
+# glibc's numbers of two of its parameters (mallopt), and the values up to which it raises them
+# where nobody sets them: so much that is free stays with us, and what is larger is a mapping of its
+# own.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+_KEPT_FREE, _OWN_MAPPING = 64 << 20, 32 << 20
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 
@@ -67,3 +72,13 @@ def give_back_freed() -> None:
     million texels two fifths of all that the process held."""
     with suppress(OSError, AttributeError, TypeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def keep_freed() -> None:
+    """Freed memory is used again, up to as much as glibc keeps by itself. Dask's nannies start
+    workers with MALLOC_TRIM_THRESHOLD_=65536, with which every array of more than 128 KiB is mapped
+    anew and zeroed by the system: a quarter of all CPU seconds of a conversion."""
+    with suppress(OSError, AttributeError, TypeError):  # another C library
+        library = ctypes.CDLL(None)
+        library.mallopt(_MMAP_THRESHOLD, _OWN_MAPPING)
+        library.mallopt(_TRIM_THRESHOLD, _KEPT_FREE)
