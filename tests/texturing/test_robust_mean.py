@@ -15,7 +15,7 @@ def _state(values: np.ndarray, deviation: np.ndarray) -> MeanState:
     deviation = np.broadcast_to(np.reshape(deviation, (count, -1)), (count, texels))
     footprint = np.tile(np.float32([1, 0, 1]), (texels, 1))
     for some, errors in zip(values.astype(np.float32), deviation.astype(np.float32), strict=True):
-        update(state, np.arange(texels, dtype=np.int32), some, errors, footprint)
+        update(state, np.arange(texels, dtype=np.int32), some, errors, footprint, footprint)
     return state
 
 
@@ -69,22 +69,51 @@ def test_few_samples_and_none():
     state = MeanState.empty(3)
     assert np.isnan(robust_mean(state).mean).all()
     one = np.array([1], np.int32)
-    update(state, one, np.float32([[1, 2, 3]]), np.float32([0.1]), np.float32([[4, 1, 2]]))
+    update(
+        state,
+        one,
+        np.float32([[1, 2, 3]]),
+        np.float32([0.1]),
+        np.float32([[4, 1, 2]]),
+        np.ones((1, 3), np.float32),
+    )
     found = robust_mean(state)
     np.testing.assert_allclose(found.mean[1], [1, 2, 3])
     np.testing.assert_allclose(found.footprint[1], [4, 1, 2])
     assert found.variance[1] == pytest.approx(0.1**2, rel=1e-4)
     assert np.isnan(found.mean[[0, 2]]).all()
     # Two of a kind: the median of the first few is between them, not one of them.
-    update(state, one, np.float32([[3, 2, 3]]), np.float32([0.1]), np.float32([[4, 1, 2]]))
+    update(
+        state,
+        one,
+        np.float32([[3, 2, 3]]),
+        np.float32([0.1]),
+        np.float32([[4, 1, 2]]),
+        np.ones((1, 3), np.float32),
+    )
     np.testing.assert_allclose(robust_mean(state).mean[1], [2, 2, 3], rtol=1e-6)
 
 
 def test_footprint_is_weighted_as_the_samples_are():
     state, texel = MeanState.empty(1), np.zeros(1, np.int32)
-    update(state, texel, np.ones((1, 3), np.float32), np.float32([1]), np.float32([[1, 0, 1]]))
-    update(state, texel, np.ones((1, 3), np.float32), np.float32([0.5]), np.float32([[6, 5, 11]]))
+    update(
+        state,
+        texel,
+        np.ones((1, 3), np.float32),
+        np.float32([1]),
+        np.float32([[1, 0, 1]]),
+        np.float32([[1, 2, 3]]),
+    )
+    update(
+        state,
+        texel,
+        np.ones((1, 3), np.float32),
+        np.float32([0.5]),
+        np.float32([[6, 5, 11]]),
+        np.float32([[2, 2, 8]]),
+    )
     np.testing.assert_allclose(robust_mean(state).footprint[0], [5, 4, 9], rtol=1e-6)
+    np.testing.assert_allclose(robust_mean(state).uneven[0], [1.8, 2, 7], rtol=1e-6)
 
 
 def test_reading_changes_nothing_and_going_on_gives_the_same_bits():
@@ -99,13 +128,13 @@ def test_reading_changes_nothing_and_going_on_gives_the_same_bits():
     footprint = np.tile(np.float32([1, 0, 1]), (40, 1))
     for some in values[7:].astype(np.float32):
         error = np.full(40, 0.1, np.float32)
-        update(saved, np.arange(40, dtype=np.int32), some, error, footprint)
+        update(saved, np.arange(40, dtype=np.int32), some, error, footprint, footprint)
     for name, array in whole._asdict().items():
         np.testing.assert_array_equal(saved._asdict()[name], array)
 
 
 def test_state_is_132_bytes_per_texel():
-    assert sum(array.nbytes for array in MeanState.empty(1000)._asdict().values()) == 132_000
+    assert sum(array.nbytes for array in MeanState.empty(1000)._asdict().values()) == 144_000
 
 
 def test_one_good_sample_beside_bad_ones_keeps_its_error():
@@ -118,5 +147,5 @@ def test_one_good_sample_beside_bad_ones_keeps_its_error():
 def test_what_is_kept_of_a_texel_is_in_single_precision():
     found = _found(np.ones((3, 5, 3)), np.full(3, 0.1))._asdict()
     assert {name: values.dtype for name, values in found.items()} == dict.fromkeys(
-        ("mean", "variance", "footprint"), np.dtype(np.float32)
+        ("mean", "variance", "footprint", "uneven"), np.dtype(np.float32)
     )

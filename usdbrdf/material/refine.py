@@ -54,10 +54,10 @@ from usdbrdf.transport.warps import shifts_of
 # Of a texel that more frames see than this, so many are taken on the average, spread over all: what
 # is left of their noise is far below the other errors.
 _MOST_SAMPLES = 24
-# Bytes that a texel takes: its state (132), its place among the blocks of texels while these are
+# Bytes that a texel takes: its state (144), its place among the blocks of texels while these are
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
 # and what it is lit by, with and without what its surface keeps.
-_OF_REFINING = BytesPerTexel(grouped=190, result=28, after=174, always=24, pixel=240)
+_OF_REFINING = BytesPerTexel(grouped=202, result=40, after=210, always=24, pixel=240)
 _OF_PATTERNS = BytesPerTexel(grouped=BYTES_OF_EQUATIONS, result=28, after=60, always=44, pixel=450)
 RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")
@@ -145,14 +145,15 @@ def refined_light(
     bounds = []
     for one in lightings:
         means = _means_without_lobes(run.part(one.name), one, reader, lobes, need, memory, seed)
-        diffuse, error = _diffuse_of_means(one, means, lobes)
-        diffuse = _with_patterns(
+        diffuse, in_own_light, error = _diffuse_of_means(one, means, lobes)
+        sharper = _with_patterns(
             run.part(one.name), one, reader, lobes, diffuse, means, memory, seed
         )
+        in_own_light = np.maximum(in_own_light + (sharper - diffuse), 0)
         bounds.append(np.where(one.before.coverage.clipped, one.before.lit.min(axis=1), 0))
         if len(lightings) > 1:
             error = np.hypot(error, one.before.irradiance_error)
-        found.append((diffuse, error))
+        found.append((sharper, in_own_light, error))
     besides = [
         beside_seen(texels, one.before.coverage.observed | one.before.emissive) for one in lightings
     ]
@@ -162,24 +163,24 @@ def refined_light(
         frames clipped."""
         shown = [
             Reflection(
-                radiance=diffuse,
+                radiance=in_own_light,
                 irradiance=incoming,
                 error=error,
                 known=one.before.coverage.observed,
                 emissive=one.before.emissive,
                 bound=bound,
             )
-            for one, (diffuse, error), bound, incoming in zip(
+            for one, (_, in_own_light, error), bound, incoming in zip(
                 lightings, found, bounds, irradiance, strict=True
             )
         ]
         base_color = base_color_of(texels, shown)
         light = []
-        for one, beside in zip(shown, besides, strict=True):
+        for one, (diffuse, *_), beside in zip(shown, found, besides, strict=True):
             hidden = base_color * one.irradiance / np.pi
-            hidden = without_leaks(hidden, one.radiance, beside)
+            hidden = without_leaks(hidden, diffuse, beside)
             told = one.measured | one.emissive
-            light.append(np.where(told[:, None], one.radiance, hidden))
+            light.append(np.where(told[:, None], diffuse, hidden))
         return base_color, light
 
     _, first = reflected([one.before.irradiance for one in lightings])
@@ -194,7 +195,7 @@ def refined_light(
         light = np.where(before.emissive[:, None], before.emission, diffuse).astype(np.float32)
         refined = refined + let_through_surfaces(own, lit, light, lobes, seed)
         irradiance.append(np.asarray(np.maximum(refined, 0) / seen, np.float32))
-    found = [(diffuse, error) for diffuse, (_, error) in zip(first, found, strict=True)]
+    found = [(diffuse, own, error) for diffuse, (_, own, error) in zip(first, found, strict=True)]
     base_color, shown = reflected(irradiance)
     reflects = metal & ~np.all([one.before.emissive for one in lightings], axis=0)
     base_color[reflects] = F0_OF_PSI * lobes.psi[owner[reflects]]
@@ -204,28 +205,37 @@ def refined_light(
     ]
 
 
-def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> tuple[Float, Float]:
-    """L_d (T, 3) of a lighting without its specular light, and its standard deviation (T,)
-    relative to it, infinite where no frame measured it."""
+def _diffuse_of_means(
+    lighting: Lighting, found: RobustMean, lobes: Lobes
+) -> tuple[Float, Float, Float]:
+    """L_d (T, 3) of a lighting without its specular light, as pixels mix it; the same of each texel
+    in its own light, of which it tells the albedo, see ``light_on_pixels``; and the standard
+    deviation (T,) relative to it, infinite where no frame measured it."""
     texels, before = lighting.lit.texels, lighting.before
     emissive, level = before.emissive, _level(before.lit)
     known = np.isfinite(found.mean[:, 0]) & ~emissive
     # Too dark for a sample in any frame: there is nothing to take off.
     dark = before.coverage.measured & ~known & ~emissive
-    shown = np.where(dark[:, None], before.lit, np.maximum(found.mean * level[:, None], 0))
-    # The light's own contrast was never blurred, see ``light_on_pixels``: that of the surface was.
-    light = _light(before)
-    variance = found.variance * (level / light.mean(axis=1)) ** 2
-    albedo = inpaint(texels, np.asarray(shown / light, np.float32), known | dark)
-    diffuse = light * restored(texels, albedo, known, variance, found.footprint)
-    diffuse = np.where(emissive[:, None], before.emission, np.maximum(diffuse, 0))
-    # What clips in every frame is at least as bright as that.
-    clipped = before.coverage.clipped[:, None]
-    diffuse = np.where(clipped, np.maximum(diffuse, before.lit), diffuse)
-    diffuse[lobes.conducts[texels.object_index()] & ~emissive] = 0
+    clipped, metal = before.coverage.clipped, lobes.conducts[texels.object_index()] & ~emissive
+
+    def restored_over(unit: Float, uneven: Float) -> Float:
+        """Of what is measured in this ``unit`` (T, 3), of which pixels blurred nothing."""
+        shown = np.where(dark[:, None], before.lit, np.maximum(found.mean * level[:, None], 0))
+        shown = np.where(known[:, None], shown * uneven, shown) / unit
+        variance = found.variance * (level / unit.mean(axis=1)) ** 2
+        filled_in = inpaint(texels, np.asarray(shown, np.float32), known | dark)
+        diffuse = unit * restored(texels, filled_in, known, variance, found.footprint)
+        diffuse = np.where(emissive[:, None], before.emission, np.maximum(diffuse, 0))
+        # What clips in every frame is at least as bright as that.
+        diffuse = np.where(clipped[:, None], np.maximum(diffuse, before.lit), diffuse)
+        diffuse[metal] = 0
+        return np.asarray(diffuse, np.float32)
+
+    one = np.ones_like(before.lit)
+    mixed, in_own_light = restored_over(one, found.uneven), restored_over(_light(before), one)
     relative = np.maximum(found.mean.mean(axis=1), 1e-3)
     error = np.where(known, np.sqrt(found.variance) / relative, np.inf)
-    return diffuse, error.astype(np.float32)
+    return mixed, in_own_light, error.astype(np.float32)
 
 
 def _light(before: LightBefore) -> Float:
@@ -328,7 +338,9 @@ def _with_frames(shown: _Shown, part: slice, start: int, observed: MeanState) ->
         uneven = beside_own_light(lit, light, texel, camera)
         values = (some.radiance[taken] - specular) / (unit[:, None] * uneven)
         own_texel = texel[within] - np.int32(part.start)
-        update(observed, own_texel, values[within], deviation[within], covered[within])
+        update(
+            observed, own_texel, values[within], deviation[within], covered[within], uneven[within]
+        )
         yield done
 
 

@@ -32,7 +32,7 @@ _AT_A_TIME = 1 << 18
 
 
 class MeanState(NamedTuple):
-    """What is kept of all samples so far: 132 bytes per texel, however many frames there were.
+    """What is kept of all samples so far: 144 bytes per texel, however many frames there were.
 
     waiting    (T, 5, 4) float32, radiance and standard deviation of samples not yet added
     samples    (T,) int32, samples so far
@@ -41,6 +41,7 @@ class MeanState(NamedTuple):
                weights of those that lie within their errors
     precision  (T,) float32, sum of 1 / variance of the samples
     footprint  (T, 3) float32, sum of the samples' footprints by 1 / variance
+    uneven     (T, 3) float32, sum of what the samples were divided by, by 1 / variance
     """
 
     waiting: Float
@@ -50,6 +51,7 @@ class MeanState(NamedTuple):
     scatter: Float
     precision: Float
     footprint: Float
+    uneven: Float
 
     @classmethod
     def empty(cls, num_texels: int) -> MeanState:
@@ -64,34 +66,40 @@ class MeanState(NamedTuple):
             scatter=zeros(2),
             precision=zeros(),
             footprint=zeros(3),
+            uneven=zeros(3),
         )
 
 
 class RobustMean(NamedTuple):
     """mean (T, 3), NaN where a texel has no sample; variance (T,), the mean over the channels, of a
-    single sample what was said of it; footprint (T, 3): covariance xx, xy, yy."""
+    single sample what was said of it; footprint (T, 3): covariance xx, xy, yy; uneven (T, 3): what
+    the samples were divided by."""
 
     mean: Float
     variance: Float
     footprint: Float
+    uneven: Float
 
 
-def update(state: MeanState, texel: Int, values: Float, deviation: Float, footprint: Float) -> None:
+def update(
+    state: MeanState, texel: Int, values: Float, deviation: Float, footprint: Float, uneven: Float
+) -> None:
     """Add one sample to each of the listed texels, in place.
 
     texel      (M,) int32, each texel at most once
     values     (M, 3) float32, finite
     deviation  (M,) float32, standard deviation of their errors, between 1e-15 and 1e15
     footprint  (M, 3) float32, covariance xx, xy, yy of a pixel on the surface
+    uneven     (M, 3) float32, what the values were divided by
     """
-    _update(len(texel), *state, texel, values, deviation, footprint)
+    _update(len(texel), *state, texel, values, deviation, footprint, uneven)
 
 
 @parallel_kernel
 def _update(
     first: int, last: int, waiting: Float, samples: Int, mean: Float, weight: Float,
-    scatter: Float, precision: Float, covered: Float, texel: Int, values: Float,
-    deviation: Float, footprint: Float,
+    scatter: Float, precision: Float, covered: Float, divided: Float, texel: Int, values: Float,
+    deviation: Float, footprint: Float, uneven: Float,
 ) -> None:  # fmt: skip
     for m in range(first, last):
         t = texel[m]
@@ -104,6 +112,7 @@ def _update(
         precision[t] += own
         for k in range(3):
             covered[t, k] += own * footprint[m, k]
+            divided[t, k] += own * uneven[m, k]
         if slot == _BATCH - 1:
             _add(waiting[t], mean[t], weight[t], scatter[t])
 
@@ -125,6 +134,7 @@ def robust_mean(state: MeanState) -> RobustMean:
             "mean": np.where(some.samples[:, None] > 0, mean, np.nan),
             "variance": variance.astype(np.float32),
             "footprint": some.footprint / np.maximum(some.precision, 1e-30)[:, None],
+            "uneven": some.uneven / np.maximum(some.precision, 1e-30)[:, None],
         }
 
     return RobustMean(**by_parts(parts, means))
