@@ -377,6 +377,22 @@ def test_meshes_of_instant_ngp_have_their_axes_turned_back(capture, kind, stated
     assert any("is one of instant-ngp's" in said for said in scan.warnings)
 
 
+@pytest.mark.parametrize("mark", [{"from_mitsuba": True}, {"normal_mts_args": [1, 2]}])
+def test_of_mitsubas_documents_instant_ngp_turns_no_axes(capture, mark):
+    with edited(capture.manifest) as document:
+        document |= mark
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, [0, 2]] *= -1
+            frame["transform_matrix"] = pose.tolist()
+    mesh = capture.folder / "mesh.ply"
+    head = b"comment output from https://github.com/NVlabs/instant-ngp\nelement vertex"
+    mesh.write_bytes(mesh.read_bytes().replace(b"element vertex", head, 1))
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-6)
+    assert not any("[mesh.frame]" in said for said in scan.warnings)
+
+
 @pytest.mark.parametrize(
     "stated", [{"aabb": [[0, 0, 0], [1, 1, 1]]}, {"offset": [1, 2]}, {"scale": 0}]
 )

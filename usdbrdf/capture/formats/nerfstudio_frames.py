@@ -98,16 +98,21 @@ def rolling_shutter(holder: Mapping[str, Any]) -> list[Any]:
 
 def lens_key(said: Mapping[str, Any]) -> str:
     """The camera_model that is meant by one of instant-ngp's keys for its lenses (read_lens); the
-    key itself where no model that is known is; "" where there is none."""
-    key = next((key for key in _NGP_LENSES if said.get(key) not in (None, False)), "")
+    key itself where no model that is known is; "" where there is none. 0 is a coefficient too."""
+    key = next((k for k in _NGP_LENSES if said.get(k) is not None and said[k] is not False), "")
     return "EQUIRECTANGULAR" if key == "latlong" else key
 
 
 def camera_axes(document: Mapping[str, Any]) -> Double:
     """(4, 4) by which the document's cameras become OpenGL's: those that instant-ngp knows as
     Mitsuba's have x to the left and look down +z (nerf_matrix_to_ngp)."""
-    is_mitsuba = document.get("from_mitsuba", "normal_mts_args" in document)
-    return np.diag([-1.0, 1, -1, 1]) if is_mitsuba is True else np.eye(4)
+    return np.diag([-1.0, 1, -1, 1]) if _is_mitsubas(document) else np.eye(4)
+
+
+def _is_mitsubas(document: Mapping[str, Any]) -> bool:
+    """Whether instant-ngp takes the document's axes for Mitsuba's, and leaves those of the world as
+    they are."""
+    return document.get("from_mitsuba") is True or "normal_mts_args" in document
 
 
 def rigid_matrix(stated: object) -> Double | None:
@@ -144,7 +149,7 @@ def geometry_at_home(
     folder           the document's
     meters_per_unit  of the capture, unless the options say it
     """
-    if any(mark in beginning_of(mesh) for mark in _OF_NGP) and not document.get("from_mitsuba"):
+    if any(mark in beginning_of(mesh) for mark in _OF_NGP) and not _is_mitsubas(document):
         findings.warn(
             f"{mesh.name}: is one of instant-ngp's, whose axes it turns; they are turned back. "
             "[mesh.frame]"
