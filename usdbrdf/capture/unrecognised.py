@@ -124,9 +124,12 @@ _PROGRAMS = (
         "ContextCapture", (".xmz",), (), _NOTHING,
         "Unzip it: it holds a BlocksExchange XML, which is read",
     ),
-    # Name, places in any coordinates and angles: all of its tables but the one that is read.
+    # Name, places in any coordinates and angles: all of its tables but the one that is read. Who
+    # measures markers writes names and places too, but no angles, and no # before them.
     _Program(
-        "RealityScan", (), (), rb"(?mi)^#? *name *, *x[^,\n]*, *y[^,\n]*, *(?:z|alt)\b",
+        "RealityScan", (), (),
+        rb"(?mi)^(#)? *name *, *x[^,\n]*, *y[^,\n]*, *(?:z|alt)\b"
+        rb"(?(1)|(?=[^,\n]*, *(?:heading|yaw|omega)))",
         "Export 'Internal/External camera parameters' (CSV) instead, which has the lens too",
     ),
     _Program(
