@@ -11,6 +11,7 @@ import pytest
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
+from tests.capture.test_pointers import POINTER
 from tests.capture.test_scan_from_colmap import pycolmap, reconstruction, write_model
 from tests.scenes import edited, make_capture, write_ply
 from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
@@ -233,6 +234,19 @@ def test_the_points_of_the_model_tell_in_which_frame_a_mesh_lies(capture, folder
         assert [f"lies in the frame of COLMAP's model {folder};" in said for said in told] == [True]
     else:
         assert ["it stays there" in said for said in told] == [True] * (name != "mesh.ply")
+
+
+def test_points_that_cannot_be_read_cost_nothing_but_what_they_tell(capture):
+    """As where Git LFS has fetched the cameras alone: captures were refused that need no points."""
+    similarity = np.eye(4)
+    similarity[:3, :3] = 1.7 * Rotation.from_euler("xyz", [70, 10, -50], degrees=True).as_matrix()
+    folder = "colmap_sparse/0"
+    _recentred(capture, folder, similarity=similarity, points=_points_on(capture))
+    (capture.folder / folder / "points3D.bin").write_text(POINTER)
+    expected = capture.points @ similarity[:3, :3].T
+    write_ply(capture.folder / "mesh.ply", expected, capture.triangles, capture.face_object)
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("lies", ["with the model", "with the document"])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Double
 from usdbrdf.untrusted.colmap_models import colmap_points
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
@@ -20,8 +21,11 @@ _ON_IT, _CLEARLY = 0.1, 3.0
 
 def lies_with_points(mesh: Path, model: Path, moved: Double) -> bool | None:
     """Whether a mesh lies where the points of a COLMAP model lie (True), or where ``moved``, a
-    similarity (4, 4), takes them (False); None where they do not tell, or are not there."""
-    points = colmap_points(model)
+    similarity (4, 4), takes them (False); None where they do not tell, or cannot be read."""
+    try:
+        points = colmap_points(model)
+    except InputRefused:  # they help, but no capture needs them
+        return None
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < _FEWEST_POINTS:
         return None
