@@ -43,8 +43,8 @@ _COLMAPS = ("meshed-poisson.ply", "meshed-delaunay.ply")
 _OF_NGP_MODELS = ("colmap_sparse", "colmap_text")
 _MODELS = ("colmap_sparse/0", "colmap_text", "colmap/sparse/0", "sparse/0", "sparse")
 # Of the cameras' spread, and of rotations: by how much two poses of one camera may differ; what is
-# less than rounding is no other frame.
-_SAME_CAMERA, _SAME_FRAME = 1e-2, 1e-6
+# less than the rounding of who writes few digits is no other frame.
+_SAME_CAMERA, _SAME_FRAME = 1e-2, 1e-4
 _LARGEST = 1e9  # number that makes sense in a matrix
 # By which instant-ngp's meshes are known, PLY and OBJ; what it takes where a document says nothing.
 _OF_NGP = (b"output from https://github.com/NVlabs/instant-ngp", b"mtllib nerf.mtl")
@@ -242,10 +242,9 @@ def _home_of_colmaps(
         return None
     model, moved = found
     name = model.relative_to(folder).as_posix()
-    if np.abs(moved - np.eye(4)).max() < _SAME_FRAME:
+    if np.array_equal(moved, np.eye(4)):
         stored = applied.similarity
-        is_same = np.abs(stored - np.eye(4)).max() < _SAME_FRAME
-        if is_same or lies_with_points(mesh, model, stored) is not False:
+        if np.array_equal(stored, np.eye(4)) or lies_with_points(mesh, model, stored) is not False:
             return None
         findings.warn(
             f"{mesh.name}: lies in the frame of the document's poses, by the points of the model "
@@ -275,8 +274,8 @@ def _capture_from_colmap(
     mesh: Path, folder: Path, findings: Findings, *, tells: bool
 ) -> tuple[Path, Double] | None:
     """The model of COLMAP beside a document, and the similarity (4, 4) from its frame to the
-    capture's; None where there is none, or nobody knows as it has not the same cameras, which is
-    told if it ``tells``."""
+    capture's, the identity where they are one but for rounding; None where there is no model, or
+    nobody knows as it has not the same cameras, which is told if it ``tells``."""
     models, frames = _models_beside(folder), findings.frames
     if not models or frames is None:
         return None
@@ -319,6 +318,9 @@ def _capture_from_colmap(
     if max(np.abs(turns - turn).max(), off.max() / spread) > _SAME_CAMERA:
         unknown(others)
         return None
+    apart = np.linalg.norm(starts[:, :3, 3] - to_places, axis=1).max() / spread
+    if max(np.abs(scale * turn - np.eye(3)).max(), apart) < _SAME_FRAME:
+        return models[0], np.eye(4)
     return models[0], rigid_pose(scale * turn, centre - scale * from_centre)
 
 
