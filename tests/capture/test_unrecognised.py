@@ -123,6 +123,7 @@ def test_documents_that_only_look_like_theirs_are_not(tmp_path):
     (tmp_path / "run.log").write_text("0 0 1\nall went well\n")
     (tmp_path / "metadata.json").write_text('{"title": "a room"}')
     (tmp_path / "other.json").write_text('{"poses": []}')
+    (tmp_path / "metadata.jsonl").write_text('{"file_name": "1.png", "text": "a room"}\n')
     (tmp_path / "markers.csv").write_text("Name,X,Y,Z\nT1,0.1,0.2,0.3\n")
     assert "it holds neither pictures nor cameras" in _refused(tmp_path)
 

@@ -154,8 +154,9 @@ _PROGRAMS = (
         "Name the scene's folder, which holds dslr/ and scans/",
     ),
     _Program(
-        "Spectacular AI", ("data.jsonl",), (), _NOTHING,
+        "Spectacular AI", (), (), rb'\A\s*\{[^\n]*"time"',
         "Make a transforms.json of them with its 'sai-cli process', and a mesh in its frame",
+        "data.jsonl",
     ),
     # Along which it is rendered, or which its viewer has stored.
     _Program(
