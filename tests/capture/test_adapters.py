@@ -176,6 +176,13 @@ def test_nothing_recognised_says_so_in_a_sentence(tmp_path):
         read_scan(tmp_path, IngestOptions(), "nonesuch")
 
 
+def test_a_pipe_is_no_capture_whatever_it_is_called(tmp_path):
+    """It was told as a full disk."""
+    os.mkfifo(tmp_path / "transforms.json")
+    with pytest.raises(InputRefused, match=r"neither a regular file nor.*\[capture\.missing\]$"):
+        read_scan(tmp_path / "transforms.json", IngestOptions())
+
+
 @pytest.mark.parametrize(
     "options",
     [

@@ -11,6 +11,7 @@ import pytest
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 
+from tests.capture.test_pointers import POINTER
 from tests.capture.test_scan_from_colmap import pycolmap, reconstruction, write_model
 from tests.scenes import edited, make_capture, write_ply
 from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
@@ -235,9 +236,24 @@ def test_the_points_of_the_model_tell_in_which_frame_a_mesh_lies(capture, folder
         assert ["it stays there" in said for said in told] == [True] * (name != "mesh.ply")
 
 
+def test_points_that_cannot_be_read_cost_nothing_but_what_they_tell(capture):
+    """As where Git LFS has fetched the cameras alone: captures were refused that need no points."""
+    similarity = np.eye(4)
+    similarity[:3, :3] = 1.7 * Rotation.from_euler("xyz", [70, 10, -50], degrees=True).as_matrix()
+    folder = "colmap_sparse/0"
+    _recentred(capture, folder, similarity=similarity, points=_points_on(capture))
+    (capture.folder / folder / "points3D.bin").write_text(POINTER)
+    expected = capture.points @ similarity[:3, :3].T
+    write_ply(capture.folder / "mesh.ply", expected, capture.triangles, capture.face_object)
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("digits", [15, 5])
 @pytest.mark.parametrize("lies", ["with the model", "with the document"])
-def test_a_mesh_in_the_frame_of_the_documents_poses_is_undone_as_they_are(capture, lies):
-    """As it is fused of depths and these poses; that of COLMAP lies in the frame before."""
+def test_a_mesh_in_the_frame_of_the_documents_poses_is_undone_as_they_are(capture, lies, digits):
+    """As it is fused of depths and these poses; that of COLMAP lies in the frame before. What is
+    rounded passed for a frame of its own."""
     folder, scale = "colmap/sparse/0", 1.5
     _recentred(capture, folder, similarity=np.eye(4), points=_points_on(capture))
     with edited(capture.manifest) as document:
@@ -245,7 +261,7 @@ def test_a_mesh_in_the_frame_of_the_documents_poses_is_undone_as_they_are(captur
         for frame in document["frames"]:
             pose = Y_UP @ np.array(frame["transform_matrix"])
             pose[:3, 3] *= scale
-            frame["transform_matrix"] = pose.tolist()
+            frame["transform_matrix"] = pose.round(digits).tolist()
     if lies == "with the document":
         stored = scale * (capture.points @ Y_UP[:3, :3].T + Y_UP[:3, 3])
         write_ply(capture.folder / "mesh.ply", stored, capture.triangles, capture.face_object)
@@ -375,6 +391,22 @@ def test_meshes_of_instant_ngp_have_their_axes_turned_back(capture, kind, stated
     scan = read_scan(capture.folder, IngestOptions())
     np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-4)
     assert any("is one of instant-ngp's" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize("mark", [{"from_mitsuba": True}, {"normal_mts_args": [1, 2]}])
+def test_of_mitsubas_documents_instant_ngp_turns_no_axes(capture, mark):
+    with edited(capture.manifest) as document:
+        document |= mark
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, [0, 2]] *= -1
+            frame["transform_matrix"] = pose.tolist()
+    mesh = capture.folder / "mesh.ply"
+    head = b"comment output from https://github.com/NVlabs/instant-ngp\nelement vertex"
+    mesh.write_bytes(mesh.read_bytes().replace(b"element vertex", head, 1))
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.mesh.points, capture.points, atol=1e-6)
+    assert not any("[mesh.frame]" in said for said in scan.warnings)
 
 
 @pytest.mark.parametrize(

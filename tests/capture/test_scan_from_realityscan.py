@@ -216,10 +216,21 @@ def test_the_model_none_is_a_pinhole_whatever_terms_stand_there(tmp_path, room):
     assert_same(read_scan(folder, OPTIONS), room, names=room.names)
 
 
-def test_a_skew_is_refused(tmp_path, room):
-    folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)
+def _with_skew(folder, skew):
     for file in folder.rglob("*.xmp"):
-        file.write_text(file.read_text().replace('Skew="0"', 'Skew="0.002"'))
+        text = file.read_text()
+        assert 'Skew="0"' in text
+        file.write_text(text.replace('Skew="0"', f'Skew="{skew}"'))
+    return folder
+
+
+def test_rounding_is_no_skew(tmp_path, room):
+    folder = _with_skew(write_sidecars(tmp_path / "scan", room, as_attributes=False), "-2.1e-15")
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+
+
+def test_a_skew_is_refused(tmp_path, room):
+    folder = _with_skew(write_sidecars(tmp_path / "scan", room, as_attributes=False), "0.002")
     with pytest.raises(InputRefused, match=r"a skew of 0\.002, which is not read.*camera\]$"):
         read_scan(folder, OPTIONS)
 

@@ -47,7 +47,14 @@ def test_the_document_itself_can_be_named(capture):
     assert len(read_scan(capture.manifest, IngestOptions()).frames) == 12
 
 
-@pytest.mark.parametrize("mark", [{"from_mitsuba": True}, {"normal_mts_args": [1, 2]}])
+@pytest.mark.parametrize(
+    "mark",
+    [
+        {"from_mitsuba": True},
+        {"normal_mts_args": [1, 2]},
+        {"normal_mts_args": [1, 2], "from_mitsuba": False},
+    ],
+)
 def test_cameras_that_instant_ngp_knows_as_mitsubas_look_the_other_way(capture, mark):
     """x to the left, y up, z forward; they passed for OpenGL's."""
     with edited(capture.manifest) as document:
@@ -60,12 +67,15 @@ def test_cameras_that_instant_ngp_knows_as_mitsubas_look_the_other_way(capture, 
     np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-12)
 
 
-@pytest.mark.parametrize("key", ["ftheta_p0", "equirectangular", "orthographic"])
-def test_lenses_of_instant_ngp_that_are_not_read_are_refused(capture, key):
-    """They passed for pinholes where an angle or a focal length stands beside them."""
+@pytest.mark.parametrize(
+    ("key", "value"), [("ftheta_p0", 0.0), ("equirectangular", True), ("orthographic", True)]
+)
+def test_lenses_of_instant_ngp_that_are_not_read_are_refused(capture, key, value):
+    """They passed for pinholes where an angle or a focal length stands beside them. The first
+    coefficient of a polynomial that begins in its centre is 0."""
     with edited(capture.manifest) as document:
         del document["camera_model"]
-        document[key] = 0.1
+        document[key] = value
     said = rf"has the camera model '{key}' \(known: PINHOLE.*\[capture\.camera\]$"
     with pytest.raises(InputRefused, match=said):
         read_scan(capture.folder, IngestOptions())

@@ -46,6 +46,8 @@ DOCUMENTS = [
         "RealityScan",
         "the lens too",
     ),
+    ("d.csv", "Name,X,Y,Z,Omega,Phi,Kappa\n", "RealityScan", "camera parameters"),
+    ("e.csv", "#name,x,y,z\n", "RealityScan", "camera parameters"),
     ("b.csv", "# name, x, y, z, omega, phi, kappa\n", "RealityScan", "camera parameters"),
     ("c.txt", "imageName X Y Z Omega Phi Kappa\n", "Pix4D", "1_initial/params/"),
     ("shots.geojson", '{"type": "FeatureCollection"}', "OpenDroneMap", "reconstruction.json"),
@@ -116,10 +118,13 @@ def test_a_document_that_names_no_program_is_none_of_theirs(tmp_path):
 
 
 def test_documents_that_only_look_like_theirs_are_not(tmp_path):
-    """A log of a program, and metadata and cameras that are not those of Record3D or of splats."""
+    """A log of a program, metadata and cameras that are not those of Record3D or of splats, and
+    markers that were measured."""
     (tmp_path / "run.log").write_text("0 0 1\nall went well\n")
     (tmp_path / "metadata.json").write_text('{"title": "a room"}')
     (tmp_path / "other.json").write_text('{"poses": []}')
+    (tmp_path / "metadata.jsonl").write_text('{"file_name": "1.png", "text": "a room"}\n')
+    (tmp_path / "markers.csv").write_text("Name,X,Y,Z\nT1,0.1,0.2,0.3\n")
     assert "it holds neither pictures nor cameras" in _refused(tmp_path)
 
 

@@ -345,6 +345,16 @@ def test_what_lies_elsewhere_is_not_published(room, tmp_path):
     assert camera.HasAPI("UsdBrdfCaptureAPI")
 
 
+def test_photographs_that_an_artist_looks_at_are_forgotten_whole(room, tmp_path):
+    """With their hashes, by which anybody who has one finds it there."""
+    room.asset.edits_layer.write_text("#usda 1.0\n(subLayers = [@layers/photographs.usdc@])\n")
+    publish(room.asset.folder, tmp_path / "dest", PublishOptions(photographs=False))
+    stage = Usd.Stage.Open(str(tmp_path / "dest/v001/room.usd"))
+    told = stage.GetPrimAtPath("/room/cameras/capture").GetAuthoredPropertyNames()
+    of_files = ("image", "photograph", "mask", "sha256")
+    assert not {f"usdBrdf:capture:{name}" for name in of_files} & {*told}
+
+
 def test_components_have_the_number_of_their_version(room, tmp_path):
     dest = tmp_path / "dest"
     publish(room.asset.folder, dest)

@@ -7,12 +7,12 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.scenes import make_capture
+from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.cli import main
 from usdbrdf.errors import ImageRefused
 from usdbrdf.files.frames import read_frame
-from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.files.images import encoded_jpeg, read_exr, write_exr
 from usdbrdf.options import IngestOptions
 
 COARSE = ("--texel-size", "0.3")
@@ -58,6 +58,26 @@ def test_a_step_takes_no_other_photographs_than_ingest_looked_at(
     # What the sentence says to do helps.
     assert main(["ingest", str(capture.folder), "-o", room, "-q"]) == 0
     assert main(["texture", room, "-q", *COARSE]) == 0
+
+
+@pytest.mark.fault("C16")
+def test_a_mask_that_changed_is_named_and_no_photograph_beside_it(tmp_path, capsys):
+    """Of two lightings, in the one that was taken later; and one of its frames has no mask."""
+    captures = [make_capture(tmp_path / name) for name in ("day", "night")]
+    masks = tmp_path / "night" / "masks"
+    masks.mkdir()
+    white = np.full((24, 32, 3), 255, np.uint8)
+    with edited(captures[1].manifest) as document:
+        for i, frame in enumerate(document["frames"][1:], 1):
+            frame["mask_path"] = f"masks/{i}.jpg"
+            (masks / f"{i}.jpg").write_bytes(encoded_jpeg(white, 90))
+    room = str(tmp_path / "room")
+    assert main(["ingest", *(str(one.folder) for one in captures), "-o", room, "-q"]) == 0
+    assert main(["texture", room, "-q", *COARSE]) == 0
+    (masks / "3.jpg").write_bytes(encoded_jpeg(white - 9, 90))
+    capsys.readouterr()
+    assert main(["texture", room, *COARSE]) == 3
+    assert f"{masks / '3.jpg'}: not the file" in capsys.readouterr().err
 
 
 def test_pixels_that_are_not_there_are_not_read(tmp_path):

@@ -202,9 +202,15 @@ def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, 
 
 
 def refuse_missing(path: Path) -> None:
-    """InputRefused where nothing lies at the path of a capture."""
+    """InputRefused where nothing lies at the path of a capture, or what is neither file nor
+    folder, as a pipe is."""
     if not path.exists():
         raise InputRefused(f"{path}: no such file or folder. Check the path. [capture.missing]")
+    if not (path.is_file() or path.is_dir()):
+        raise InputRefused(
+            f"{path}: neither a regular file nor a folder. Name the capture's folder. "
+            "[capture.missing]"
+        )
 
 
 def _loaded(point: EntryPoint) -> Adapter:

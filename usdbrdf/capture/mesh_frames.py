@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from usdbrdf.model.arrays import Double
+from usdbrdf.errors import InputRefused
+from usdbrdf.model.arrays import Double, Int
 from usdbrdf.untrusted.colmap_models import colmap_points
 from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
 
-# Places on the mesh and points that are compared; fewer points say nothing.
-_PLACES, _MOST_POINTS, _FEWEST_POINTS = 100_000, 20_000, 30
+# Places on the mesh, faces that are looked at at a time, or whose corners are compared, and points
+# that are; fewer of these say nothing.
+_PLACES, _MOST_FACES, _MOST_POINTS, _FEWEST_POINTS = 100_000, 500_000, 20_000, 30
 # Half of the points lie nearer to their mesh than this, in parts of their spread, and farther from
 # one of another frame by this factor.
 _ON_IT, _CLEARLY = 0.1, 3.0
@@ -20,8 +22,11 @@ _ON_IT, _CLEARLY = 0.1, 3.0
 
 def lies_with_points(mesh: Path, model: Path, moved: Double) -> bool | None:
     """Whether a mesh lies where the points of a COLMAP model lie (True), or where ``moved``, a
-    similarity (4, 4), takes them (False); None where they do not tell, or are not there."""
-    points = colmap_points(model)
+    similarity (4, 4), takes them (False); None where they do not tell, or cannot be read."""
+    try:
+        points = colmap_points(model)
+    except InputRefused:  # they help, but no capture needs them
+        return None
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < _FEWEST_POINTS:
         return None
@@ -42,15 +47,22 @@ def _off(surface: cKDTree, points: Double) -> float:
 
 
 def _places_on(mesh: FileMesh) -> Double:
-    """Corners and places evenly over all faces: large ones have few corners."""
-    corners = mesh.points[mesh.triangles].astype(np.float64)
-    a, b, c = np.moveaxis(corners, 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    """Places evenly over all faces, large ones have few corners; and corners, which lie close where
+    there is detail."""
+    parts = np.array_split(mesh.triangles, -(-len(mesh.triangles) // _MOST_FACES))
+    area = np.concatenate([_areas(mesh, some) for some in parts])
     before = np.concatenate([[0.0], np.cumsum(area)])
     chance = np.random.default_rng(0)
     where = chance.uniform(0, before[-1], _PLACES)
     face = np.clip(np.searchsorted(before, where, side="right") - 1, 0, len(area) - 1)
+    a, b, c = np.moveaxis(mesh.points[mesh.triangles[face]].astype(np.float64), 1, 0)
     u, v = chance.uniform(size=(2, _PLACES, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    within = a[face] + u * (b - a)[face] + v * (c - a)[face]
-    return np.concatenate([within, mesh.points[np.unique(mesh.triangles)].astype(np.float64)])
+    some = np.unique(mesh.triangles[:: len(parts)])
+    return np.concatenate([a + u * (b - a) + v * (c - a), mesh.points[some].astype(np.float64)])
+
+
+def _areas(mesh: FileMesh, triangles: Int) -> Double:
+    """(T,) twice those of some faces."""
+    a, b, c = np.moveaxis(mesh.points[triangles].astype(np.float64), 1, 0)
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1), np.float64)

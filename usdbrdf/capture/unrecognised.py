@@ -124,9 +124,12 @@ _PROGRAMS = (
         "ContextCapture", (".xmz",), (), _NOTHING,
         "Unzip it: it holds a BlocksExchange XML, which is read",
     ),
-    # Name, places in any coordinates and angles: all of its tables but the one that is read.
+    # Name, places in any coordinates and angles: all of its tables but the one that is read. Who
+    # measures markers writes names and places too, but no angles, and no # before them.
     _Program(
-        "RealityScan", (), (), rb"(?mi)^#? *name *, *x[^,\n]*, *y[^,\n]*, *(?:z|alt)\b",
+        "RealityScan", (), (),
+        rb"(?mi)^(#)? *name *, *x[^,\n]*, *y[^,\n]*, *(?:z|alt)\b"
+        rb"(?(1)|(?=[^,\n]*, *(?:heading|yaw|omega)))",
         "Export 'Internal/External camera parameters' (CSV) instead, which has the lens too",
     ),
     _Program(
@@ -151,8 +154,9 @@ _PROGRAMS = (
         "Name the scene's folder, which holds dslr/ and scans/",
     ),
     _Program(
-        "Spectacular AI", ("data.jsonl",), (), _NOTHING,
+        "Spectacular AI", (), (), rb'\A\s*\{[^\n]*"time"',
         "Make a transforms.json of them with its 'sai-cli process', and a mesh in its frame",
+        "data.jsonl",
     ),
     # Along which it is rendered, or which its viewer has stored.
     _Program(

@@ -25,9 +25,10 @@ from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 
 PHOTOGRAPHS, CAPTURED = "photographs", "captured"  # folders for what lies elsewhere
 _LAYERS = frozenset({".usd", ".usda", ".usdc"})
-# Attributes that name photographs and their masks, and schemas that are about nothing else.
+# Attributes that tell which photographs and masks these are, and schemas about nothing else.
 OF_PHOTOGRAPHS = (
-    "usdBrdf:capture:image", "usdBrdf:capture:photograph", "usdBrdf:capture:mask", "backPlate:",
+    "usdBrdf:capture:image", "usdBrdf:capture:photograph", "usdBrdf:capture:mask",
+    "usdBrdf:capture:sha256", "backPlate:",
 )  # fmt: skip
 SCHEMAS_OF_PHOTOGRAPHS = ("BackPlateAPI:",)
 _UDIM = "<UDIM>"
@@ -134,8 +135,8 @@ def write_collection(
 
 
 def forget_photographs(layer: Sdf.Layer) -> bool:
-    """Take out what says where the photographs and their masks are; returns whether there was
-    any."""
+    """Take out what says which the photographs and their masks are, and where; returns whether
+    there was any."""
     gone: list[Sdf.PropertySpec] = []
     changed: list[Sdf.Path] = []
 

@@ -39,7 +39,7 @@ _OF_THE_MACHINE = {
 }  # fmt: skip
 # What helps against some of them, where it is neither space nor permission.
 _CURES = {
-    errno.EFBIG: "Raise this shell's limit on the size of files (ulimit -f), or that of the disk",
+    errno.EFBIG: "Raise this shell's limit on the size of files (ulimit -f), or name another disk",
     errno.EMFILE: "Raise this shell's limit on open files (ulimit -n)",
     errno.ENFILE: "Close other programs, which hold all files that this machine can open",
 }

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import re
 import struct
+from array import array
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -85,12 +86,12 @@ def read_points_here(file: Path) -> Double:
             rows = [line.split(None, 4)[1:4] for line in lines if not line.startswith("#")]
         numbers = [row for row in rows if len(row) == 3 and all(map(_NUMBER.fullmatch, row))]
         return np.array(numbers, np.float64).reshape(-1, 3)
-    content, at, points = file.read_bytes(), 8, []
+    content, at, points = file.read_bytes(), 8, array("d")
     # Number, place, colour, error, and 8 bytes for each image that shows it.
     layout = struct.Struct("<Q3d3BdQ")
     while at + layout.size <= len(content):
         _, x, y, z, *_, shown = layout.unpack_from(content, at)
-        points.append((x, y, z))
+        points.extend((x, y, z))
         at += layout.size + 8 * shown
     return np.array(points, np.float64).reshape(-1, 3)
 

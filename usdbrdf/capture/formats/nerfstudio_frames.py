@@ -43,8 +43,8 @@ _COLMAPS = ("meshed-poisson.ply", "meshed-delaunay.ply")
 _OF_NGP_MODELS = ("colmap_sparse", "colmap_text")
 _MODELS = ("colmap_sparse/0", "colmap_text", "colmap/sparse/0", "sparse/0", "sparse")
 # Of the cameras' spread, and of rotations: by how much two poses of one camera may differ; what is
-# less than rounding is no other frame.
-_SAME_CAMERA, _SAME_FRAME = 1e-2, 1e-6
+# less than the rounding of who writes few digits is no other frame.
+_SAME_CAMERA, _SAME_FRAME = 1e-2, 1e-4
 _LARGEST = 1e9  # number that makes sense in a matrix
 # By which instant-ngp's meshes are known, PLY and OBJ; what it takes where a document says nothing.
 _OF_NGP = (b"output from https://github.com/NVlabs/instant-ngp", b"mtllib nerf.mtl")
@@ -98,16 +98,21 @@ def rolling_shutter(holder: Mapping[str, Any]) -> list[Any]:
 
 def lens_key(said: Mapping[str, Any]) -> str:
     """The camera_model that is meant by one of instant-ngp's keys for its lenses (read_lens); the
-    key itself where no model that is known is; "" where there is none."""
-    key = next((key for key in _NGP_LENSES if said.get(key) not in (None, False)), "")
+    key itself where no model that is known is; "" where there is none. 0 is a coefficient too."""
+    key = next((k for k in _NGP_LENSES if said.get(k) is not None and said[k] is not False), "")
     return "EQUIRECTANGULAR" if key == "latlong" else key
 
 
 def camera_axes(document: Mapping[str, Any]) -> Double:
     """(4, 4) by which the document's cameras become OpenGL's: those that instant-ngp knows as
     Mitsuba's have x to the left and look down +z (nerf_matrix_to_ngp)."""
-    is_mitsuba = document.get("from_mitsuba", "normal_mts_args" in document)
-    return np.diag([-1.0, 1, -1, 1]) if is_mitsuba is True else np.eye(4)
+    return np.diag([-1.0, 1, -1, 1]) if _is_mitsubas(document) else np.eye(4)
+
+
+def _is_mitsubas(document: Mapping[str, Any]) -> bool:
+    """Whether instant-ngp takes the document's axes for Mitsuba's, and leaves those of the world as
+    they are."""
+    return document.get("from_mitsuba") is True or "normal_mts_args" in document
 
 
 def rigid_matrix(stated: object) -> Double | None:
@@ -144,7 +149,7 @@ def geometry_at_home(
     folder           the document's
     meters_per_unit  of the capture, unless the options say it
     """
-    if any(mark in beginning_of(mesh) for mark in _OF_NGP) and not document.get("from_mitsuba"):
+    if any(mark in beginning_of(mesh) for mark in _OF_NGP) and not _is_mitsubas(document):
         findings.warn(
             f"{mesh.name}: is one of instant-ngp's, whose axes it turns; they are turned back. "
             "[mesh.frame]"
@@ -237,10 +242,9 @@ def _home_of_colmaps(
         return None
     model, moved = found
     name = model.relative_to(folder).as_posix()
-    if np.abs(moved - np.eye(4)).max() < _SAME_FRAME:
+    if np.array_equal(moved, np.eye(4)):
         stored = applied.similarity
-        is_same = np.abs(stored - np.eye(4)).max() < _SAME_FRAME
-        if is_same or lies_with_points(mesh, model, stored) is not False:
+        if np.array_equal(stored, np.eye(4)) or lies_with_points(mesh, model, stored) is not False:
             return None
         findings.warn(
             f"{mesh.name}: lies in the frame of the document's poses, by the points of the model "
@@ -270,8 +274,8 @@ def _capture_from_colmap(
     mesh: Path, folder: Path, findings: Findings, *, tells: bool
 ) -> tuple[Path, Double] | None:
     """The model of COLMAP beside a document, and the similarity (4, 4) from its frame to the
-    capture's; None where there is none, or nobody knows as it has not the same cameras, which is
-    told if it ``tells``."""
+    capture's, the identity where they are one but for rounding; None where there is no model, or
+    nobody knows as it has not the same cameras, which is told if it ``tells``."""
     models, frames = _models_beside(folder), findings.frames
     if not models or frames is None:
         return None
@@ -314,6 +318,9 @@ def _capture_from_colmap(
     if max(np.abs(turns - turn).max(), off.max() / spread) > _SAME_CAMERA:
         unknown(others)
         return None
+    apart = np.linalg.norm(starts[:, :3, 3] - to_places, axis=1).max() / spread
+    if max(np.abs(scale * turn - np.eye(3)).max(), apart) < _SAME_FRAME:
+        return models[0], np.eye(4)
     return models[0], rigid_pose(scale * turn, centre - scale * from_centre)
 
 

@@ -56,6 +56,7 @@ _NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 _DESCRIBED = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
 _COLUMNS = frozenset(("name", "x", "y", "alt"))
 _FULL_FRAME_MM = 36.0
+_NO_SKEW = 1e-6  # what scripts that write XMP leave of 0
 # Models without terms; what is read as one of Brown's is called so, brown3t2 for example.
 _NO_TERMS = ("none", "perspective")
 _EXPORT = 'Export the registration as "Internal/External camera parameters"'
@@ -188,7 +189,7 @@ def records_of_sidecars(
                 f"{file}: the lens model {model!r} is not read. Choose Brown in the alignment's "
                 "settings, and export again. [capture.camera]"
             )
-        if number_in(said, "Skew"):
+        if abs(number_in(said, "Skew") or 0.0) > _NO_SKEW:
             raise InputRefused(
                 f"{file}: its lens has a skew of {said['Skew'][:40]}, which is not read. Set it to "
                 "0 in the alignment's settings, and export again. [capture.camera]"
