@@ -324,6 +324,7 @@ class _Maps:
 
     def __init__(self, frames):
         self.frames = frames
+        self.hashes_of_frames = [""] * len(frames)
 
     def layers_elsewhere(self, folder):
         return []

@@ -239,10 +239,10 @@ def _diffuse_of_means(
 
 
 def _light(before: LightBefore) -> Float:
-    """(T, 3): S of each texel, W/m^2, and no less than a little."""
+    """(T, 3): S of each texel, W/m^2, and no less than a little; 1 where there is none at all."""
     light = before.irradiance
-    light = np.maximum(light, max(_DARKEST * float(np.median(light.mean(axis=1))), 1e-30))
-    return np.asarray(light, np.float32)
+    least = _DARKEST * float(np.median(light.mean(axis=1)))
+    return np.asarray(np.maximum(light, least) if least > 0 else np.ones_like(light), np.float32)
 
 
 def _level(lit: Float) -> Float:

@@ -106,11 +106,20 @@ def refuse_special_behind(layer: str) -> None:
 
 
 def _clips_of(layer: Sdf.Layer) -> list[str]:
-    """What else a layer names that USD may open as one, among it the files of value clips, which
-    are no dependencies of the composition."""
+    """What else a layer with value clips names that USD may open as one, among it their files,
+    which are no dependencies of the composition."""
+    clips: list[Sdf.Path] = []
+
+    def look(path: Sdf.Path) -> None:
+        if path.IsPrimPath() or path.IsPrimVariantSelectionPath():
+            prim = layer.GetPrimAtPath(path)
+            clips.extend([path] if prim and prim.HasInfo("clips") else [])
+
     with suppress(Tf.ErrorException):
-        named = UsdUtils.ExtractExternalReferences(layer.identifier)
-        return [name for kind in named for name in kind if Path(name).suffix in _ENDINGS]
+        layer.Traverse(Sdf.Path.absoluteRootPath, look)
+        if clips:
+            named = UsdUtils.ExtractExternalReferences(layer.identifier)
+            return [name for kind in named for name in kind if Path(name).suffix in _ENDINGS]
     return []
 
 
