@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -222,6 +223,37 @@ def test_without_workers_a_run_ends_though_all_is_sent(
                 next(results)
     finally:
         ended.set()
+
+
+@pytest.mark.parametrize("takes_s", [0.0, 1.0])
+def test_waiting_for_workers_ends_however_long_starting_some_takes(
+    takes_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To Dask a time of 0 s is no limit."""
+    from usdbrdf.cluster import engine
+
+    monkeypatch.setattr(engine, "_NO_WORKERS", 0.5)
+    waited = []
+
+    def wait_for_workers(count: int, timeout: float) -> None:
+        waited.append(timeout)
+        if len(waited) > 20:
+            raise AssertionError
+        time.sleep(timeout)
+        raise TimeoutError
+
+    def nobody() -> dict[str, int]:
+        return {}
+
+    client = SimpleNamespace(
+        scheduler=SimpleNamespace(address="inproc://none"),
+        nthreads=nobody,
+        wait_for_workers=wait_for_workers,
+    )
+    workers = engine.DaskWorkers(client, None, 60.0, lambda: time.sleep(takes_s))  # type: ignore[arg-type]
+    with pytest.raises(EnvironmentFailure, match=r"no worker came.*\[cluster.workers\]"):
+        workers.elsewhere()
+    assert all(timeout > 0 for timeout in waited)
 
 
 def test_a_photograph_that_a_worker_alone_cannot_read_is_told_with_the_worker(

@@ -149,16 +149,14 @@ class DaskWorkers:
         while not (threads := self._asked(self._client.nthreads)):
             self._renew()
             left = end - time.monotonic()
+            if left <= 0:
+                raise self._no_workers()
             try:
-                self._client.wait_for_workers(1, timeout=max(0.0, min(left, _ANEW)))
-            except (*_LATE, *_GONE) as error:
-                if isinstance(error, _LATE) and left > _ANEW:
-                    continue
-                raise EnvironmentFailure(
-                    f"{self._address}: no worker came in {_NO_WORKERS:.0f} s. Start some for this "
-                    "scheduler, then run the same command again; finished work is kept. "
-                    "[cluster.workers]"
-                ) from error
+                self._client.wait_for_workers(1, timeout=min(left, _ANEW))
+            except _LATE:
+                continue
+            except _GONE as error:
+                raise self._no_workers() from error
         return sum(threads.values())
 
     def _name(self, future: Future, files: Files) -> str:
@@ -266,6 +264,13 @@ class DaskWorkers:
                     stimulus_id="usdbrdf-hangs",
                 )
             )
+
+    def _no_workers(self) -> EnvironmentFailure:
+        return EnvironmentFailure(
+            f"{self._address}: no worker came in {_NO_WORKERS:.0f} s. Start some for this "
+            "scheduler, then run the same command again; finished work is kept. "
+            "[cluster.workers]"
+        )
 
     def _gone(self) -> EnvironmentFailure:
         return EnvironmentFailure(
