@@ -275,9 +275,9 @@ def _points(first: int, last: int, camera: _Pinhole, nearness: Float, point: Flo
 
 
 @kernel
-def place_on_face(points: Float, triangles: Int, f: int, p: Float) -> tuple[float, float]:
-    """Barycentric (u, v) of the point p (3,) on triangle f, by least squares, for it lies in its
-    plane; (-1, -1) of a triangle without an area."""
+def place_on_face(points: Float, triangles: Int, f: int, p: Float) -> tuple[bool, float, float]:
+    """Has triangle f an area, and barycentric (u, v) of the point p (3,) on it, by least squares,
+    for it lies in its plane; beside a corner both may be a little less than zero."""
     a, b, c = triangles[f]
     e00, e01, e11, r0, r1 = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
@@ -291,5 +291,5 @@ def place_on_face(points: Float, triangles: Int, f: int, p: Float) -> tuple[floa
         r1 += aside * off
     determinant = e00 * e11 - e01 * e01
     if determinant <= 0:
-        return -1.0, -1.0
-    return (e11 * r0 - e01 * r1) / determinant, (e00 * r1 - e01 * r0) / determinant
+        return False, 0.0, 0.0
+    return True, (e11 * r0 - e01 * r1) / determinant, (e00 * r1 - e01 * r0) / determinant

@@ -337,6 +337,8 @@ def _with_frames(shown: _Shown, part: slice, start: int, observed: MeanState) ->
         deviation = np.asarray(error * wide, np.float32)
         uneven = beside_own_light(lit, light, texel, camera)
         values = (some.radiance[taken] - specular) / (unit[:, None] * uneven)
+        # What makes a sample brighter makes its errors larger.
+        deviation /= np.minimum(uneven.mean(axis=1), 1)
         own_texel = texel[within] - np.int32(part.start)
         update(
             observed, own_texel, values[within], deviation[within], covered[within], uneven[within]

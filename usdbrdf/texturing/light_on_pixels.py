@@ -41,6 +41,8 @@ def beside_own_light(
 
     light  S as a texture of the surface, W/m^2
     """
+    if not len(texel):  # as of most frames where many workers share the texels out
+        return np.ones((0, 3), np.float32)
     texels = surface.texels
     drawn = light_on_pixels(surface, light, camera)
     every, none = np.ones(drawn.shape[:2], np.bool_), np.zeros(drawn.shape[:2], np.bool_)
@@ -97,9 +99,11 @@ def _light_at(
             f = face[j, i]
             if f < 0:
                 continue
-            u, v = place_on_face(points, triangles, f, point[j, i])
-            if u < 0 and v < 0:
+            known, u, v = place_on_face(points, triangles, f, point[j, i])
+            if not known:
                 continue
             place, width, x, y = packed_place(light, f, u, v)
-            red, green, blue = packed_colour(light, place, width, x, y)
+            # S is the mean over a texel: between the middles of two it would be blurred once more.
+            right, down = np.float32(x >= 0.5), np.float32(y >= 0.5)
+            red, green, blue = packed_colour(light, place, width, right, down)
             out[j, i, 0], out[j, i, 1], out[j, i, 2], out[j, i, 3] = red, green, blue, 1.0

@@ -115,8 +115,8 @@ def _places(
             f = face[j, i]
             if f < 0:
                 continue
-            u, v = place_on_face(points, triangles, f, point[j, i])
-            if u < 0 and v < 0:
+            known, u, v = place_on_face(points, triangles, f, point[j, i])
+            if not known:
                 continue
             for k in range(2):
                 q = corner_pixel[f]
