@@ -23,7 +23,7 @@ from usdbrdf.model.arrays import Float, Int
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.samples import Picture, first_surfaces, samples_from_frame
 from usdbrdf.transport.lit_scene import TexturedScene
-from usdbrdf.transport.surface_texture import SurfaceTexture, packed_colour, packed_place
+from usdbrdf.transport.surface_texture import SurfaceTexture, packed_place
 
 # Points of a pixel to each side, and how much of them its mean takes: a pixel's square, blurred by
 # half its side. With bilinear reading that is a deviation of 0.6 pixels, ``refine.sample_blur``.
@@ -104,6 +104,7 @@ def _light_at(
                 continue
             place, width, x, y = packed_place(light, f, u, v)
             # S is the mean over a texel: between the middles of two it would be blurred once more.
-            right, down = np.float32(x >= 0.5), np.float32(y >= 0.5)
-            red, green, blue = packed_colour(light, place, width, right, down)
-            out[j, i, 0], out[j, i, 1], out[j, i, 2], out[j, i, 3] = red, green, blue, 1.0
+            nearest = place + (x >= 0.5) + (width if y >= 0.5 else 0)
+            for c in range(3):
+                out[j, i, c] = light.pixels[nearest, c]
+            out[j, i, 3] = 1.0
