@@ -505,8 +505,8 @@ def test_frames_are_decoded_once_where_memory_suffices(
 
     monkeypatch.setattr("usdbrdf.files.frames.read_frame", counting)
     found = _fitted(room, f"read with {memory}", usdbrdf.FitOptions(memory=memory))
-    # For the survey, for the means and for the patterns.
-    assert decoded == dict.fromkeys(range(NUM_FRAMES), 1 if memory is None else 3)
+    # For the survey, for the means and for the patterns, with S and without.
+    assert decoded == dict.fromkeys(range(NUM_FRAMES), 1 if memory is None else 4)
     assert _contents(found.folder) == _contents(fitted.folder)
 
 

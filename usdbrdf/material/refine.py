@@ -146,14 +146,15 @@ def refined_light(
     for one in lightings:
         means = _means_without_lobes(run.part(one.name), one, reader, lobes, need, memory, seed)
         diffuse, in_own_light, error = _diffuse_of_means(one, means, lobes)
-        sharper = _with_patterns(
-            run.part(one.name), one, reader, lobes, diffuse, means, memory, seed
+        # S is sharp, but may be wrong: what pictures show is told without it.
+        diffuse, in_own_light = (
+            _with_patterns(run.part(part), one, reader, lobes, shown, means, memory, seed)
+            for part, shown in ((one.name, diffuse), (f"{one.name}:in-own-light", in_own_light))
         )
-        in_own_light = np.maximum(in_own_light + (sharper - diffuse), 0)
         bounds.append(np.where(one.before.coverage.clipped, one.before.lit.min(axis=1), 0))
         if len(lightings) > 1:
             error = np.hypot(error, one.before.irradiance_error)
-        found.append((sharper, in_own_light, error))
+        found.append((diffuse, in_own_light, error))
     besides = [
         beside_seen(texels, one.before.coverage.observed | one.before.emissive) for one in lightings
     ]
