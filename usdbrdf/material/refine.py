@@ -57,7 +57,7 @@ _MOST_SAMPLES = 24
 # Bytes that a texel takes: its state (144), its place among the blocks of texels while these are
 # sorted out, and what the next frames show of it; its mean; blurring and filling in, afterwards;
 # and what it is lit by, with and without what its surface keeps.
-_OF_REFINING = BytesPerTexel(grouped=202, result=40, after=210, always=24, pixel=240)
+_OF_REFINING = BytesPerTexel(grouped=202, result=40, after=218, always=24, pixel=240)
 _OF_PATTERNS = BytesPerTexel(grouped=BYTES_OF_EQUATIONS, result=28, after=60, always=44, pixel=450)
 RELATIVE_ERROR = calibration.number("refine.relative_error")
 _OF_LOBE = calibration.number("refine.of_lobe")

@@ -142,7 +142,7 @@ def _blurred_sunlight(surface: TexturedScene, index: Long, sun: Sun, seed: int) 
         weight = there * np.exp(-0.5 * (right**2 + down**2) / _BLUR**2)
         total += weight * sunlit(surface, beside, sun, seed)
         weights += weight
-    return np.asarray(total / weights)
+    return np.asarray(total / np.maximum(weights, 1e-12))
 
 
 def _spread(count: int) -> Double:
