@@ -188,6 +188,16 @@ def edited(path: Path) -> Iterator[dict[str, Any]]:
     path.write_text(json.dumps(document))
 
 
+def as_mitsubas(capture: MadeCapture, mark: dict[str, Any]) -> None:
+    """The same cameras as instant-ngp knows Mitsuba's, by such a mark: x to the left, z forward."""
+    with edited(capture.manifest) as document:
+        document |= mark
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, [0, 2]] *= -1
+            frame["transform_matrix"] = pose.tolist()
+
+
 def room_mesh(
     *, room: bool = True, subdivisions: int = 4
 ) -> tuple[Float, Int, Int, tuple[str, ...]]:

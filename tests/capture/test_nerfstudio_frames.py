@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.capture.test_pointers import POINTER
 from tests.capture.test_scan_from_colmap import pycolmap, reconstruction, write_model
-from tests.scenes import edited, make_capture, write_ply
+from tests.scenes import as_mitsubas, edited, make_capture, write_ply
 from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
@@ -395,12 +395,7 @@ def test_meshes_of_instant_ngp_have_their_axes_turned_back(capture, kind, stated
 
 @pytest.mark.parametrize("mark", [{"from_mitsuba": True}, {"normal_mts_args": [1, 2]}])
 def test_of_mitsubas_documents_instant_ngp_turns_no_axes(capture, mark):
-    with edited(capture.manifest) as document:
-        document |= mark
-        for frame in document["frames"]:
-            pose = np.array(frame["transform_matrix"])
-            pose[:3, [0, 2]] *= -1
-            frame["transform_matrix"] = pose.tolist()
+    as_mitsubas(capture, mark)
     mesh = capture.folder / "mesh.ply"
     head = b"comment output from https://github.com/NVlabs/instant-ngp\nelement vertex"
     mesh.write_bytes(mesh.read_bytes().replace(b"element vertex", head, 1))

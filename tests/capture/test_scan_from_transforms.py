@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.scenes import edited, make_capture, rescale_images, room_mesh, write_ply
+from tests.scenes import as_mitsubas, edited, make_capture, rescale_images, room_mesh, write_ply
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.frames import read_frame
@@ -57,12 +57,7 @@ def test_the_document_itself_can_be_named(capture):
 )
 def test_cameras_that_instant_ngp_knows_as_mitsubas_look_the_other_way(capture, mark):
     """x to the left, y up, z forward; they passed for OpenGL's."""
-    with edited(capture.manifest) as document:
-        document |= mark
-        for frame in document["frames"]:
-            pose = np.array(frame["transform_matrix"])
-            pose[:3, [0, 2]] *= -1
-            frame["transform_matrix"] = pose.tolist()
+    as_mitsubas(capture, mark)
     scan = read_scan(capture.folder, IngestOptions())
     np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-12)
 

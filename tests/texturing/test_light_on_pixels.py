@@ -88,7 +88,7 @@ def test_beside_the_light_on_their_pixels_samples_tell_the_albedo(world: World):
     def off(radiance: np.ndarray) -> np.ndarray:
         return np.abs(np.pi * radiance / light[seen] / ALBEDO - 1)
 
-    ratio = beside_own_light(surface, surface.texture(light), seen, camera)
+    ratio = beside_own_light(surface, texels.object_index(), surface.texture(light), seen, camera)
     assert np.percentile(off(radiance[seen]), 75) > 0.4
     assert np.percentile(off(radiance[seen] / ratio), 75) < 0.12
     assert abs(np.median(np.pi * radiance[seen] / ratio / light[seen] / ALBEDO) - 1) < 0.03
@@ -99,7 +99,8 @@ def test_where_light_is_even_nothing_changes():
     surface = TexturedScene(world.scene, world.texels, world.rays)
     light = np.broadcast_to(np.float32([2, 3, 4]), (len(world.texels), 3)).copy()
     every = np.arange(len(light), dtype=np.int32)
-    found = beside_own_light(surface, surface.texture(light), every, _camera())
+    owner = world.texels.object_index()
+    found = beside_own_light(surface, owner, surface.texture(light), every, _camera())
     np.testing.assert_allclose(found, 1, atol=1e-5)
 
 
@@ -110,7 +111,8 @@ def test_what_is_not_known_or_hardly_so_is_left_within_reason():
     light[world.texels.position[:, 1] > 0] = 0  # nobody knows
     light[world.texels.position[:, 1] < -0.2] *= 1e-6  # next to dark, beside what is not
     every = np.arange(len(light), dtype=np.int32)
-    found = beside_own_light(surface, surface.texture(light), every, _camera())
+    owner = world.texels.object_index()
+    found = beside_own_light(surface, owner, surface.texture(light), every, _camera())
     assert np.isfinite(found).all()
     assert (found[light[:, 0] == 0] == 1).all()
     assert found.min() >= 0.25

@@ -65,53 +65,32 @@ def test_errors_larger_than_said_are_reported_as_they_are():
     assert 0.6 * found.mean.var() < found.variance.mean() < 1.2 * found.mean.var()
 
 
+def _add(
+    state: MeanState, texel: int, value: list, error: float, beside: list, uneven: list
+) -> None:
+    """One sample more."""
+    one = (np.float32([row]) for row in (beside, uneven))
+    update(state, np.array([texel], np.int32), np.float32([value]), np.float32([error]), *one)
+
+
 def test_few_samples_and_none():
     state = MeanState.empty(3)
     assert np.isnan(robust_mean(state).mean).all()
-    one = np.array([1], np.int32)
-    update(
-        state,
-        one,
-        np.float32([[1, 2, 3]]),
-        np.float32([0.1]),
-        np.float32([[4, 1, 2]]),
-        np.ones((1, 3), np.float32),
-    )
+    _add(state, 1, [1, 2, 3], 0.1, [4, 1, 2], [1, 1, 1])
     found = robust_mean(state)
     np.testing.assert_allclose(found.mean[1], [1, 2, 3])
     np.testing.assert_allclose(found.footprint[1], [4, 1, 2])
     assert found.variance[1] == pytest.approx(0.1**2, rel=1e-4)
     assert np.isnan(found.mean[[0, 2]]).all()
     # Two of a kind: the median of the first few is between them, not one of them.
-    update(
-        state,
-        one,
-        np.float32([[3, 2, 3]]),
-        np.float32([0.1]),
-        np.float32([[4, 1, 2]]),
-        np.ones((1, 3), np.float32),
-    )
+    _add(state, 1, [3, 2, 3], 0.1, [4, 1, 2], [1, 1, 1])
     np.testing.assert_allclose(robust_mean(state).mean[1], [2, 2, 3], rtol=1e-6)
 
 
 def test_footprint_is_weighted_as_the_samples_are():
-    state, texel = MeanState.empty(1), np.zeros(1, np.int32)
-    update(
-        state,
-        texel,
-        np.ones((1, 3), np.float32),
-        np.float32([1]),
-        np.float32([[1, 0, 1]]),
-        np.float32([[1, 2, 3]]),
-    )
-    update(
-        state,
-        texel,
-        np.ones((1, 3), np.float32),
-        np.float32([0.5]),
-        np.float32([[6, 5, 11]]),
-        np.float32([[2, 2, 8]]),
-    )
+    state = MeanState.empty(1)
+    _add(state, 0, [1, 1, 1], 1, [1, 0, 1], [1, 2, 3])
+    _add(state, 0, [1, 1, 1], 0.5, [6, 5, 11], [2, 2, 8])
     np.testing.assert_allclose(robust_mean(state).footprint[0], [5, 4, 9], rtol=1e-6)
     np.testing.assert_allclose(robust_mean(state).uneven[0], [1.8, 2, 7], rtol=1e-6)
 

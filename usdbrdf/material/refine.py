@@ -113,8 +113,8 @@ class Lighting(NamedTuple):
 class Refined:
     """diffuse (T, 3) W/(m^2 sr): L_d without specular light; irradiance (T, 3) W/m^2: S of that and
     of the lobes, as it counts for what dielectrics scatter below their surface and is seen from the
-    front; base_color (T, 3) in [0, 1]: pi L_d / S of these two, F0 of a metal; of several lightings
-    the mean of what each tells, the same for all."""
+    front; base_color (T, 3) in [0, 1]: pi L_d / S but for what pixels mix (``light_on_pixels``), F0
+    of a metal; of several lightings the mean of what each tells, the same for all."""
 
     diffuse: Float
     irradiance: Float
@@ -336,7 +336,7 @@ def _with_frames(shown: _Shown, part: slice, start: int, observed: MeanState) ->
         wide = np.maximum(widest(covered) ** 2 + 0.5, 1) ** 0.25
         error = np.sqrt(RELATIVE_ERROR**2 + noise**2 + of_lobe**2)
         deviation = np.asarray(error * wide, np.float32)
-        uneven = beside_own_light(lit, light, texel, camera)
+        uneven = beside_own_light(lit, owner, light, texel, camera)
         values = (some.radiance[taken] - specular) / (unit[:, None] * uneven)
         # What makes a sample brighter makes its errors larger.
         deviation /= np.minimum(uneven.mean(axis=1), 1)

@@ -34,12 +34,13 @@ _MOST = calibration.number("refine.most_uneven")
 
 
 def beside_own_light(
-    surface: TexturedScene, light: SurfaceTexture, texel: Int, camera: Camera
+    surface: TexturedScene, owner: Int, light: SurfaceTexture, texel: Int, camera: Camera
 ) -> Float:
     """(M, 3): the mean of S over what ``camera`` reads for texels (M,) over their own; 1 where
     either is not known, and within reason elsewhere.
 
-    light  S as a texture of the surface, W/m^2
+    owner  (T,): the object of each texel of the surface
+    light  S as a texture of it, W/m^2
     """
     if not len(texel):  # as of most frames where many workers share the texels out
         return np.ones((0, 3), np.float32)
@@ -48,7 +49,7 @@ def beside_own_light(
     every, none = np.ones(drawn.shape[:2], np.bool_), np.zeros(drawn.shape[:2], np.bool_)
     _, mean = samples_from_frame(
         texels,
-        texels.object_index(),
+        owner,
         first_surfaces(surface.rays, surface.scene.face_object, camera),
         Picture(drawn, every, none, none),
         camera,
