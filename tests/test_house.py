@@ -167,6 +167,7 @@ ENGINEERING: dict[str, str] = {
     "LEAST_OF_SEGMENT": "texels that a statistic needs",
     "MIN_FRAMES": "limit of what is refused",
     "MIXTURE": "rays: noise against time",
+    "MOST_SAMPLES": "time",
     "NEUTRAL": "mathematics: medians before any evidence",
     "NOTHING": "codes of what a texel shows in a frame",
     "NOTHING_KNOWN": "mathematics: deviation of the even distribution",

@@ -27,9 +27,10 @@ from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.job import task as task_module
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.task import TaskRun
-from usdbrdf.material import refine
-from usdbrdf.material.refine import Lighting, Refined, refined_light
+from usdbrdf.material import refine, refined_means
+from usdbrdf.material.refine import Refined, refined_light
 from usdbrdf.material.refined_irradiance import Lobes, refined_irradiance
+from usdbrdf.material.refined_means import Lighting
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
@@ -374,7 +375,7 @@ def test_what_is_too_dark_for_a_sample_stays_dark(room: Room):
         irradiance=atlas.irradiance,
     )  # fmt: skip
     lobes, lighting = _lobes(atlas), Lighting("", atlas.lit_scene(black_environment()), before, ())
-    level = refine._level(lit)[:, None]
+    level = refined_means.level_of(lit)[:, None]
     mean = np.where(atlas.coverage.measured[:, None], lit / level, np.nan).astype(np.float32)
     mean[dark] = np.nan
     flat = np.zeros(len(lit), np.float32)
@@ -471,7 +472,7 @@ def _contents(folder: Path) -> dict[str, str]:
 
 def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatch):
     starts = []
-    through_all = refine.samples_from_frames
+    through_all = refined_means.samples_from_frames
 
     def interrupted(surface, frames, read, order, part):
         starts.append(NUM_FRAMES - len(order))
@@ -482,7 +483,7 @@ def test_an_interrupted_refinement_goes_on(room: Room, fitted: Asset, monkeypatc
 
     monkeypatch.setattr(task_module, "_SAVE_AFTER", 0.0)
     monkeypatch.setattr(task_module, "_SAVE_SELDOM", 0.0)
-    monkeypatch.setattr(refine, "samples_from_frames", interrupted)
+    monkeypatch.setattr(refined_means, "samples_from_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
         _fitted(room, "again", usdbrdf.FitOptions())
     folder = room.folder / "assets" / "again"
@@ -515,7 +516,7 @@ def test_passes_for_lack_of_memory_change_no_byte(room: Room, fitted: Asset, mon
         ends = [0, len(texels) // 3, len(texels) // 2, len(texels)]
         return [slice(a, b) for a, b in pairwise(ends)]
 
-    monkeypatch.setattr(refine, "groups_of_texels", three)
+    monkeypatch.setattr(refined_means, "groups_of_texels", three)
     set_quiet(False)
     thrice = _fitted(room, "thrice", usdbrdf.FitOptions(memory=1.0))
     set_quiet(True)
@@ -535,7 +536,7 @@ def test_too_little_memory_is_no_reason_to_stop_at_the_end(room: Room, fitted: A
 def test_of_texels_that_many_frames_see_some_samples_are_enough():
     texel = np.arange(40_000, dtype=np.int32)
     samples = np.repeat(np.float32([5, 24, 48, 96]), 10_000)
-    frames = [refine._subsample(texel, samples, frame, 7) for frame in range(48)]
+    frames = [refined_means.subsample(texel, samples, frame, 7) for frame in range(48)]
     share = np.mean(frames, axis=0).reshape(4, -1)
     assert (share[:2] == 1).all()
     np.testing.assert_allclose(share[2:].mean(axis=1), [0.5, 0.25], atol=0.005)
@@ -543,5 +544,5 @@ def test_of_texels_that_many_frames_see_some_samples_are_enough():
     np.testing.assert_allclose(share[2:].std(axis=1), np.sqrt([0.25 / 48, 0.1875 / 48]), rtol=0.05)
     some = np.arange(25_000, 40_000, 7)
     np.testing.assert_array_equal(
-        refine._subsample(texel[some], samples[some], 3, 7), frames[3][some]
+        refined_means.subsample(texel[some], samples[some], 3, 7), frames[3][some]
     )

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.material.fit_views import ABOVE_NOISE, MIN_OBSERVATIONS, MIN_VIEWS
-from usdbrdf.material.refine import OF_NOISE_FLOOR, RELATIVE_ERROR
+from usdbrdf.material.refined_means import OF_NOISE_FLOOR, RELATIVE_ERROR
 from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
     MAX_PSI_ERROR,

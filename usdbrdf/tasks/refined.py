@@ -17,8 +17,9 @@ from usdbrdf.asset.properties import FittedObject, MeasuredObject, colour
 from usdbrdf.files.frames import FrameReader
 from usdbrdf.job.task import TaskRun
 from usdbrdf.material.fit_objects import ObjectFit, judged
-from usdbrdf.material.refine import Lighting, refined_light
+from usdbrdf.material.refine import refined_light
 from usdbrdf.material.refined_irradiance import Lobes
+from usdbrdf.material.refined_means import Lighting
 from usdbrdf.options import FitOptions
 from usdbrdf.tasks.task import Task
 from usdbrdf.transport.lit_scene import LitScene
