@@ -116,6 +116,28 @@ def test_the_lobe_comes_back_within_its_errors(phi: float, psi: float):
     assert np.median(psi_errors) < 0.2
 
 
+def test_light_that_is_badly_known_widens_the_errors():
+    """What lobes mirror is off in each frame by a share of its own, which the model of the samples'
+    errors, in units of diffuse radiance, does not know."""
+    stated, off = [], []
+    for seed in SEEDS:
+        samples, mirrored = _views(seed)
+        basis = _basis(mirrored)
+        rng = np.random.default_rng([seed, 11])
+        share = np.exp(0.4 * rng.standard_normal(FRAMES)).astype(np.float32)[samples.frame, None]
+        errors = []
+        for times in (np.ones_like(share), share):
+            base, slope = basis(0.16)
+            shone = samples.radiance + times * (base + np.float32(0.7) * slope)
+            found = _fit(replace(samples, radiance=shone), (basis, 0.0))
+            errors.append(found.psi_error)
+        stated.append(errors)
+        off.append((found.psi - 0.7) / found.psi_error)
+    right, wrong = np.median(stated, axis=0)
+    assert wrong > 1.5 * right
+    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.5
+
+
 def test_errors_that_frames_share_are_no_lobe():
     evidence, phi_error = [], []
     for seed in SEEDS:

@@ -10,7 +10,6 @@ import pytest
 from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
     MAX_PSI_ERROR,
-    MIN_EVIDENCE,
     MOST_CONTRADICTED,
     MOST_OF_MEASURED,
     NEUTRAL,
@@ -33,11 +32,11 @@ def _lobe(**numbers: float) -> LobeEstimate:
     return sharp._replace(**numbers)
 
 
-@pytest.mark.parametrize("evidence", [MIN_EVIDENCE, 1.0])
+@pytest.mark.parametrize("evidence", [SOME_EVIDENCE, 1.0])
 def test_a_measurement_is_published_as_found(evidence: float):
     found = verdict_on_views(_lobe(evidence=evidence), True)
     assert (found.phi, found.psi, found.psi_error) == (0.1, 0.8, 0.05)
-    assert found.phi_error == 0.02 if evidence == 1 else found.phi_error > 0.02
+    assert found.phi_error == 0.02
     assert (found.phi_confidence, found.psi_confidence) == ("high", "high")
     assert (found.status, found.psi_upper) == ("measured", 0.9)
 
@@ -84,13 +83,12 @@ def test_each_parameter_is_judged_by_its_own_error(share: float):
 
 
 @pytest.mark.fault("L3")
-@pytest.mark.parametrize("evidence", [0.0, 0.9 * SOME_EVIDENCE, SOME_EVIDENCE, 0.9 * MIN_EVIDENCE])
+@pytest.mark.parametrize("evidence", [0.0, 0.9 * SOME_EVIDENCE])
 def test_without_a_highlight_what_remains_likely_is_published(evidence: float):
     found = verdict_on_views(_lobe(evidence=evidence, psi_median=0.05, psi_upper=0.2), True)
     assert (found.phi, found.psi, found.psi_upper) == (0.3, 0.05, 0.2)
     # However small the errors.
-    confidence = "low" if evidence >= SOME_EVIDENCE else "none"
-    assert (found.phi_confidence, found.psi_confidence) == (confidence, confidence)
+    assert (found.phi_confidence, found.psi_confidence) == ("none", "none")
     assert found.status == "prior"
 
 
@@ -145,25 +143,16 @@ def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
         assert found.phi_error == pytest.approx(math.hypot(0.02, unresolved))
         # A blurred highlight holds the same light.
         assert found.psi_error == pytest.approx(
-            math.hypot(0.05, 0.8 / 3 * min(unresolved / 0.1, 1)), rel=0.03
+            math.hypot(0.05, 0.08 * min(unresolved / 0.1, 1)), rel=0.03
         )
         assert found.phi_confidence == confidence
 
 
-def test_a_lobe_that_explains_less_is_less_certain_of_phi():
-    # Of redrawn rooms, fits with half of the evidence were off by more than twice the stated error.
-    errors = [
-        verdict_on_views(_lobe(evidence=evidence), True).phi_error
-        for evidence in (1.0, 0.9, 0.5, 0.2, 0.0)
-    ]
-    assert errors == sorted(errors)
-    assert errors[1] < 1.25 * errors[0]
-    assert errors[2] == pytest.approx(2.3 * errors[0], rel=0.1)
-    assert errors[-1] == pytest.approx(NOTHING_KNOWN)
-    # So a highlight that is badly explained is no measurement, if its width was hardly known.
-    wide = _lobe(phi_error=0.06)
-    assert verdict_on_views(wide, True).status == "measured"
-    assert verdict_on_views(wide._replace(evidence=MIN_EVIDENCE), True).status == "prior"
+@pytest.mark.parametrize("share", [0.45, 0.55])
+def test_a_lobe_within_twice_its_error_of_none_is_no_measurement(share: float):
+    # In a stairwell by others a lobe of 0.5 came out as 0.04 +- 0.03.
+    found = verdict_on_views(_lobe(psi=0.1, psi_error=share * 0.1), True)
+    assert found.status == ("measured" if share < 0.5 else "prior")
 
 
 @pytest.mark.fault("L2")

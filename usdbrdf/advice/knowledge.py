@@ -22,11 +22,9 @@ from usdbrdf.material.refined_means import OF_NOISE_FLOOR, RELATIVE_ERROR
 from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
     MAX_PSI_ERROR,
-    MIN_EVIDENCE,
     MODEL_DISCREPANCY,
     NOTHING_KNOWN,
     SOME_EVIDENCE,
-    UNEXPLAINED,
 )
 from usdbrdf.model.arrays import Bool, Double, Float, Long
 
@@ -231,11 +229,11 @@ def outlook(
         for values in (known.phi, known.psi)
     ]
     evidence = own / (1 + own)
-    unexplained = (1 - evidence) / np.maximum(evidence, 1e-6)
-    errors[0] *= coarser[0] * np.sqrt(1 + UNEXPLAINED * unexplained)
-    errors[1] *= coarser[1]
-    of_phi, of_psi = (np.minimum(error, NOTHING_KNOWN) for error in errors)
-    measured = (evidence >= MIN_EVIDENCE) & (known.psi > of_psi)
+    of_phi, of_psi = (
+        np.minimum(times * error, NOTHING_KNOWN)
+        for times, error in zip(coarser, errors, strict=True)
+    )
+    measured = (evidence >= SOME_EVIDENCE) & (known.psi > 2 * of_psi)
     measured &= (of_phi <= MAX_PHI_ERROR) & (of_psi <= MAX_PSI_ERROR)
     probability = float(likely @ measured)
     # Where there is no lobe, further photographs do not find one.
@@ -243,6 +241,6 @@ def outlook(
     of_phi_mean, of_psi_mean = (float(likely @ errors) + none for errors in (of_phi, of_psi))
     knows = 1 - (of_phi_mean + of_psi_mean) / (2 * NOTHING_KNOWN)
     # Knowing a little of two objects is not as good as measuring one.
-    on_the_way = (knows + float(likely @ np.minimum(evidence / MIN_EVIDENCE, 1))) / 2
+    on_the_way = (knows + float(likely @ np.minimum(evidence / SOME_EVIDENCE, 1))) / 2
     worth = (2 * probability + on_the_way) / 3
     return Outlook(of_phi_mean, of_psi_mean, probability, worth)

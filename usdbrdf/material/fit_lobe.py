@@ -32,39 +32,81 @@ _NOISY = calibration.number("fit.noisy_rays")
 _REPEATS = 4
 
 
-def error_of_rays(
-    model: ViewModel, radiance: Float, bases: tuple[Pair, Pair], phis: Sequence[float], psi: float
-) -> tuple[float, float]:
-    """Standard deviations of phi and psi that the rays' noise alone brings about.
+class Linear(NamedTuple):
+    """The lobe of P samples about what was found, from two bases with independent noise.
 
-    radiance  (P, 3) of the samples
-    bases     twice (base, slope), (P, 3, 3) each, with independent noise, at three ``phis``: the
-              one that was found and its neighbours
-
-    (phi, psi) solve J1' C^-1 (I - M2) + J2' C^-1 (I - M1) = 0, M being the predicted lobe and J its
-    derivatives. Noise in them moves the solution by H^-1 / 2 times the sum over both of J' C^-1 n
-    and, the other way, d' C^-1 e; H = J1' C^-1 J2, e what is left of the samples. A sum of two
-    independent noises has the variance of their difference, which is known. Rays of different
-    texels are independent, those of one texel's views hang together.
+    by_first, by_second  (P, 3, 2): its derivatives by phi and psi
+    between              (P, 3): the difference of the two
+    solved               (P, 3, 6): C^-1 of the derivatives and of what either leaves of the samples
+    precision            (2, 2): H = J1' C^-1 J2, with that of the prior at least
     """
-    lobes = [base + np.float32(psi) * slope for base, slope in bases]
-    step = phis[2] - phis[0]
-    first, second = (
-        np.stack([(lobe[..., 2] - lobe[..., 0]) / step, slope[..., 1]], axis=-1)
-        for lobe, (_, slope) in zip(lobes, bases, strict=True)
-    )
-    left = radiance - (lobes[0] + lobes[1])[..., 1] / 2
-    solved = model.solved(np.concatenate([first, second, left[..., None]], axis=-1))
-    along = (solved[..., :2] + solved[..., 2:4]) / 2
-    each = np.einsum("pci,pc->pi", along, (lobes[0] - lobes[1])[..., 1])
-    each -= np.einsum("pci,pc->pi", first - second, solved[..., 4])
-    pull = model.sums_of_texels(each) / 2
-    crossed = np.einsum("pci,pcj->ij", solved[..., :2], second)
-    # With the prior's precision at least: noise may leave less than that of it.
-    values, vectors = np.linalg.eigh((crossed + crossed.T) / 2)
-    inverse = (vectors / (np.maximum(values, 0) + NOTHING_KNOWN**-2)) @ vectors.T
-    by_phi, by_psi = np.sqrt(((pull @ inverse) ** 2).sum(axis=0))
-    return float(by_phi), float(by_psi)
+
+    by_first: Double
+    by_second: Double
+    between: Double
+    solved: Double
+    precision: Double
+
+    @classmethod
+    def about(
+        cls,
+        model: ViewModel,
+        radiance: Float,
+        bases: tuple[Pair, Pair],
+        phis: Sequence[float],
+        psi: float,
+    ) -> Linear:
+        """radiance (P, 3) of the samples; bases: twice (base, slope), (P, 3, 3) each, at three
+        ``phis``: the one that was found and its neighbours."""
+        lobes = [base + np.float32(psi) * slope for base, slope in bases]
+        step = phis[2] - phis[0]
+        first, second = (
+            np.stack([(lobe[..., 2] - lobe[..., 0]) / step, slope[..., 1]], axis=-1)
+            for lobe, (_, slope) in zip(lobes, bases, strict=True)
+        )
+        left = [(radiance - lobe[..., 1])[..., None] for lobe in lobes]
+        solved = model.solved(np.concatenate([first, second, *left], axis=-1))
+        crossed = np.einsum("pci,pcj->ij", solved[..., :2], second)
+        # Noise may leave less than the prior's precision of it.
+        values, vectors = np.linalg.eigh((crossed + crossed.T) / 2)
+        precision = (vectors * (np.maximum(values, 0) + NOTHING_KNOWN**-2)) @ vectors.T
+        return cls(first, second, (lobes[0] - lobes[1])[..., 1], solved, precision)
+
+    def error_of_rays(self, sums_of_texels: Callable[[Double], Double]) -> tuple[float, float]:
+        """Standard deviations of phi and psi that the rays' noise alone brings about.
+
+        (phi, psi) solve J1' C^-1 (I - M2) + J2' C^-1 (I - M1) = 0, M being the predicted lobe and J
+        its derivatives. Noise in them moves the solution by H^-1 / 2 times the sum over both of
+        J' C^-1 n and, the other way, d' C^-1 e; e is what is left of the samples. A sum of two
+        independent noises has the variance of their difference, which is known. Rays of different
+        texels are independent, those of one texel's views hang together.
+        """
+        along = (self.solved[..., :2] + self.solved[..., 2:4]) / 2
+        each = np.einsum("pci,pc->pi", along, self.between)
+        left = self.solved[..., 4:].mean(axis=-1)
+        each -= np.einsum("pci,pc->pi", self.by_first - self.by_second, left)
+        pull = sums_of_texels(each) / 2
+        by_phi, by_psi = np.sqrt(((pull @ np.linalg.inv(self.precision)) ** 2).sum(axis=0))
+        return float(by_phi), float(by_psi)
+
+    def scatter(self, groups: Sequence[Long]) -> tuple[float, float]:
+        """By how much the variances of phi and psi exceed what C tells, 1 or more, as the samples
+        of a frame, or of a place, pull them together the same way; ``groups``: of each kind the
+        group of each sample, (P,). Of all kinds the largest, by H^-1 J H^-1, J being the sum over
+        groups of their pulls' squares (K.-Y. Liang and S. L. Zeger, Longitudinal data analysis
+        using generalized linear models, 1986)."""
+        each = np.einsum("pci,pc->pi", self.by_first, self.solved[..., 5])
+        each += np.einsum("pci,pc->pi", self.by_second, self.solved[..., 4])
+        told, largest = np.linalg.inv(self.precision), np.ones(2)
+        for group in groups:
+            number = int(group.max()) + 1
+            if number <= each.shape[1]:  # as many numbers as phi and psi scatter by nothing
+                continue
+            pull = np.stack([np.bincount(group, one, number) for one in each.T], axis=1) / 2
+            moved = (pull - pull.mean(axis=0)) @ told
+            square = (moved**2).sum(axis=0) * number / (number - each.shape[1])
+            largest = np.maximum(largest, square / np.diagonal(told))
+        return float(largest[0]), float(largest[1])
 
 
 def first_seed(seed: int) -> int:
@@ -177,10 +219,12 @@ class _Fit:
         noisy = least + (float(self._model.product(rest, rest).mean()) - least) / repeats
         freedom = self._model.degrees_of_freedom
         neighbours = phis[near].tolist()
-        of_rays = error_of_rays(self._model, self._radiance[..., 0], bases, neighbours, psi)
+        linear = Linear.about(self._model, self._radiance[..., 0], bases, neighbours, psi)
+        of_rays = linear.error_of_rays(self._model.sums_of_texels)
+        scatter = linear.scatter(self._model.groups)
         of_mean = of_rays[0] / math.sqrt(repeats), of_rays[1] / math.sqrt(repeats)
         blur = self._candidate.blur
-        found = lobe_from_costs(phis, terms, without, noisy, freedom, blur, of_mean)
+        found = lobe_from_costs(phis, terms, without, noisy, freedom, blur, scatter, of_mean)
         return found._replace(of_rays=of_rays)
 
     def _terms(self, first: Pair, second: Pair) -> Double:

@@ -56,6 +56,7 @@ def lobe_from_costs(
     noisy: float,
     freedom: int,
     blur: float,
+    scatter: tuple[float, float] = (1.0, 1.0),
     of_rays: tuple[float, float] = (0.0, 0.0),
 ) -> LobeEstimate:
     """The best lobe and its errors.
@@ -67,6 +68,7 @@ def lobe_from_costs(
     freedom  degrees of freedom, for the unit of the cost
     blur     standard deviation, in radians, of the surface normal over the footprint of a sample: a
              lobe narrower than that is not seen as such
+    scatter  how much larger the variances of phi and psi are than the costs tell, 1 or more
     of_rays  what the rays' noise does to phi and psi
     """
     psi, profile, square = least_costs(terms, abs(without))
@@ -75,7 +77,7 @@ def lobe_from_costs(
     surface = terms[:, :1] - 2 * _PSI_GRID * terms[:, 1:2] + _PSI_GRID**2 * square[:, None]
     # Where rays are noisy, what they show is badly known as well, as the place of a mirrored lamp.
     noise_ratio = max(1.0, noisy / max(least, 1e-12))
-    temper = max(1.0, MODEL_DISCREPANCY * max(least, 0.0)) * noise_ratio
+    of_phi, of_psi = (one * noise_ratio for one in scatter)
     lowest = min(float(surface.min()), without)
 
     def likely(temper: float) -> tuple[Double, float]:
@@ -86,18 +88,18 @@ def lobe_from_costs(
         none /= none + float(density.sum()) / len(_PSI_GRID)
         return density / density.sum(), none
 
-    density, _ = likely(temper)
-    phi_error = _deviation(density.sum(axis=1), phis, phi)
+    by_phi, by_psi = likely(of_phi)[0].sum(axis=1), likely(of_psi)[0].sum(axis=0)
+    phi_error = _deviation(by_phi, phis, phi)
     best_psi = float(np.interp(phi, phis, psi))
-    psi_error = _deviation(density.sum(axis=0), _PSI_GRID, best_psi)
+    psi_error = _deviation(by_psi, _PSI_GRID, best_psi)
     footprint = math.hypot(phi, _BADLY_KNOWN * blur) - phi
+    (phi_median,) = _quantiles(by_phi, phis, (0.5,))
     # The errors leave out what the rays do to psi, which is added to them. Whether there is a lobe
     # is told by psi, whose variance temper / c2 grows by that.
-    density, none = likely(temper + of_rays[1] ** 2 * float(square[profile.argmin()]))
+    density, none = likely(of_psi + of_rays[1] ** 2 * float(square[profile.argmin()]))
     middle = (0.5 - none) / (1 - none) if none < 0.5 else 0.0
     psi_median, psi_upper = _quantiles(density.sum(axis=0), _PSI_GRID, (middle, 0.95))
     psi_median = psi_median if middle > 0 else 0.0
-    (phi_median,) = _quantiles(density.sum(axis=1), phis, (0.5,))
     return LobeEstimate(
         phi=phi,
         psi=best_psi,
@@ -183,7 +185,6 @@ def usual_lobe(class_name: str, label: str) -> tuple[float, float] | None:
     return None
 
 
-MIN_EVIDENCE = calibration.number("verdict.min_evidence")
 SOME_EVIDENCE = calibration.number("verdict.some_evidence")
 MOST_CONTRADICTED = calibration.number("verdict.most_contradicted")
 MOST_OF_MEASURED = calibration.number("verdict.most_contradicted_of_measured")
@@ -191,7 +192,6 @@ MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
 MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
 _MAX_F0_ERROR = calibration.number("conductor.max_f0_error")
 _PSI_SHARE = calibration.number("verdict.footprint_in_psi")
-UNEXPLAINED = calibration.number("verdict.unexplained_in_phi")
 _MAX_FLAT_PHI = calibration.number("verdict.of_frame.max_flat_phi") / math.sqrt(12)
 _MIN_EVIDENCE_OF_FRAME = calibration.number("verdict.of_frame.min_evidence")
 
@@ -226,8 +226,8 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
 
     What the frames determine is published as found. Of a highlight that is hardly larger than the
     samples' footprint they say something, but the stated error includes what the footprint may have
-    done; phi's grows also by what the lobe leaves unexplained. Where they do not determine both
-    numbers, the medians of what remains likely are published: no highlight is knowledge too.
+    done. Where they do not determine both numbers, the medians of what remains likely are
+    published: no highlight is knowledge too.
     What is seen through a thing, or in it, changes with the view as no lobe does: then the numbers
     are none of a surface's and not measured; they stay, for what shows resembles the views more
     than what has no lobe. Names and classes of objects tell nothing here.
@@ -235,13 +235,11 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     if lobe is None:
         return _not_asked(seen)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
-    unexplained = (1 - lobe.evidence) / max(lobe.evidence, 1e-6)
-    phi_error = lobe.phi_error * math.sqrt(1 + UNEXPLAINED * unexplained)
-    phi_error = min(math.hypot(phi_error, lobe.unresolved), NOTHING_KNOWN)
+    phi_error = min(math.hypot(lobe.phi_error, lobe.unresolved), NOTHING_KNOWN)
     psi_error = min(math.hypot(lobe.psi_error, of_psi), NOTHING_KNOWN)
 
     # Where something changes with the view, but reflects next to nothing, it is no surface's lobe.
-    shows = lobe.evidence >= MIN_EVIDENCE and lobe.psi > psi_error
+    shows = lobe.evidence >= SOME_EVIDENCE and lobe.psi > 2 * psi_error
 
     def confidence(error: float, limit: float) -> str:
         if shows and error <= limit:

@@ -175,6 +175,10 @@ _TAIL = calibration.number("errors.student_freedom")
 LEAST_DIFFUSE = calibration.number("errors.least_diffuse")
 
 
+# Parts of space across an object within which errors are taken to hang together.
+_PLACES = calibration.number("errors.places_across")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ViewSamples:
     """P samples: texel (P,) counted from 0 without gaps, frame (P,), position (P, 3) in metres,
@@ -187,6 +191,13 @@ class ViewSamples:
     radiance: Float
     noise: Float
     cell: float
+
+    @property
+    def places(self) -> Long:
+        """(P,): the part of space that each sample lies in, ``_PLACES`` across, counted from 0."""
+        place = self.position - self.position.min(axis=0)
+        part = np.floor(place * (_PLACES / max(float(place.max()), 1e-30))).astype(np.int64)
+        return np.unique(part, axis=0, return_inverse=True)[1].ravel()
 
 
 class Reduced(NamedTuple):
@@ -221,6 +232,8 @@ class ViewModel:
         self._specular = np.zeros_like(mean)
         # Of all samples, what is left for errors after each texel took its mean.
         self._freedom = count / (count - len(views))
+        # What may be off alike in more ways than the shared errors say.
+        self.groups = np.unique(samples.frame, return_inverse=True)[1], samples.places
         every = _effects(samples)
         self._effects = effects_of_frames(every, samples.frame)
         self._deviation = np.full(len(every), _FIRST_GUESS)
