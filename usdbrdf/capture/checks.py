@@ -243,25 +243,44 @@ def _is_whole_tiff(path: Path) -> bool:
 def tagged_encoding(
     records: Sequence[FrameRecord], usual: str, findings: Findings, source: Path
 ) -> str:
-    """The colour space that the first image says it has, of which the user is told; ``usual`` where
-    it says none of the same kind."""
-    name, tag = "", None
-    with suppress(ImageRefused):  # of which the reader of its pixels will tell
-        name, places = colour_tag(records[0].image_path) if records else ("", ())
-        tag = encoding_of_tag(name, places)
-    if name and tag is None and kind_of_encoding(usual) == "display":
+    """The colour space that the images say they have, of which the user is told; ``usual`` where
+    they say none of the same kind. InputRefused where they say several."""
+    display = kind_of_encoding(usual) == "display"
+    first_of: dict[str, Path] = {}
+    unknown: dict[str, str] = {}
+    for record in records:
+        with suppress(ImageRefused):  # of which the reader of its pixels will tell
+            name, places = colour_tag(record.image_path)
+            tag = encoding_of_tag(name, places)
+            if tag is None and (name and display):
+                unknown.setdefault(record.image_path.name, f"colour space is {name!r}")
+            elif tag is None and places:
+                said = ", ".join(f"{place:.4g}" for place in places)
+                unknown.setdefault(record.image_path.name, f"primaries and white are {said}")
+            elif tag is not None and display and kind_of_encoding(tag) == "linear":
+                unknown.setdefault(record.image_path.name, f"values are linear ({tag})")
+            alike = tag is not None and (kind_of_encoding(tag) == "display") == display
+            first_of.setdefault(tag if tag and alike else usual, record.image_path)
+    if len(first_of) > 1:
+        (one, first), (other, second), *_ = first_of.items()
+        raise InputRefused(
+            f"{source}: the images have several colour spaces: {first.name!r} is {one}, "
+            f"{second.name!r} {other}. Convert them to one, or state --input-space to have all "
+            "read as one. [capture.encoding]"
+        )
+    if unknown:
+        image, said = next(iter(unknown.items()))
         findings.warn(
-            f"{source.name}: the images say that their colour space is {name!r}, which is not "
-            f"known; they are read as {usual}. Convert them to sRGB, or state --input-space. "
+            f"{source.name}: {len(unknown)} images say that their {said}, first {image!r}, which "
+            f"is not read here: they pass for {usual}. Convert them, or state --input-space. "
             "[capture.encoding]"
         )
-    kinds = [kind_of_encoding(encoding) == "display" for encoding in (tag or usual, usual)]
-    if tag is None or tag == usual or kinds[0] != kinds[1]:
-        return usual
-    findings.warn(
-        f"{source.name}: the images say that their colour space is {tag}, and are read so. State "
-        "--input-space if they are not. [capture.encoding]"
-    )
+    tag = next(iter(first_of), usual)
+    if tag != usual:
+        findings.warn(
+            f"{source.name}: the images say that their colour space is {tag}, and are read so. "
+            "State --input-space if they are not. [capture.encoding]"
+        )
     return tag
 
 
