@@ -379,11 +379,50 @@ def test_old_documents_of_nerfstudio_had_turned_the_world(tmp_path):
     assert any("[capture.legacy]" in warning for warning in scan.warnings)
 
 
+@pytest.mark.parametrize("old", [True, False])
+def test_the_model_beside_a_document_tells_whether_its_world_was_turned(tmp_path, old):
+    """Documents without applied_transform that other programs write lie as the model does."""
+    made = make_capture(tmp_path / "room")
+    camera = pycolmap.Camera(model="PINHOLE", width=32, height=24, params=[19.2, 19.2, 16, 12])
+    names = [f"{i:04d}.png" for i in range(12)]
+    write_model(made.folder / "colmap/sparse/0", reconstruction(made, [camera], names))
+    legacy = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    with edited(made.manifest) as document:
+        for frame in document["frames"] if old else ():
+            frame["transform_matrix"] = (legacy @ frame["transform_matrix"]).tolist()
+    scan = read_scan(made.folder, OPTIONS)
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera, atol=1e-9)
+    told = [sentence for sentence in scan.warnings if "[capture.legacy]" in sentence]
+    assert ["state applied_transform" in sentence for sentence in told] == [False] * old
+
+
 def _images_through(made, folder, model, scale=1):
     camera = camera_of(model, scale)
     folder.mkdir(parents=True)
     for i in range(10):
         write_exr(folder / f"{i:04d}.exr", seen_through(camera, made.world_from_camera[i], made))
+
+
+@pytest.mark.parametrize("folder", ["sparse_txt", "model", "sparse/final", "sparse/0/text"])
+def test_a_folder_of_a_model_alone_may_be_called_anything(tmp_path, folder):
+    made = colmap_capture(tmp_path / "room", "PINHOLE", text="t" in folder, sparse=folder)
+    assert choose_adapter(made.folder).name == "colmap"
+    scan = read_scan(made.folder, OPTIONS)
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera, atol=1e-9)
+
+
+def test_a_folder_that_holds_several_captures_is_none(tmp_path):
+    """Each has its images beside its model."""
+    colmap_capture(tmp_path / "rooms" / "one", "PINHOLE", sparse="")
+    with pytest.raises(InputRefused, match=r"one/ in it is one \(colmap\)"):
+        choose_adapter(tmp_path / "rooms")
+
+
+@pytest.mark.parametrize("named", ["sparse", "sparse/0"])
+def test_the_model_alone_says_which_folder_holds_its_images(tmp_path, named):
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    with pytest.raises(InputRefused, match=rf"Name {made.folder}, where they are\. \[colmap"):
+        read_scan(made.folder / named, OPTIONS)
 
 
 @pytest.fixture

@@ -3,7 +3,8 @@
 ::
 
     CAPTURE/
-      sparse/0/ or sparse/ or the folder itself     cameras and images, distorted or not
+      sparse/0/ or sparse/ or the folder itself     cameras and images, distorted or not; else any
+                                                    folder that holds a model and nothing else
       images/, input/, images_2/ ...                as the model names them, in subfolders too;
                                                     else the only other folder that holds them,
                                                     none of normals, depths or masks
@@ -55,8 +56,10 @@ _MODELS = ("", "sparse/0", "sparse", "colmap_sparse/0", "colmap_text")
 _IMAGES = ("images", "input", "", "images_2", "images_4", "images_8")
 # What scaled-down copies of images are in.
 _REDUCED = re.compile(r"(^|/)images_\d+$")
-# How deep in the capture other folders of images are looked for.
-_BELOW = ("*/", "*/*/")
+# How deep in the capture other folders of images are looked for, and of models; what lies beside
+# these.
+_BELOW, _MODELS_BELOW = ("*/", "*/*/"), ("*/", "*/*/", "*/*/*/")
+_BESIDE_MODELS = frozenset((".bin", ".txt", ".db", ".ini", ".ply", ".json", ".yaml", ".log"))
 # Words in the names of folders whose pictures are no photographs, although they are called as these
 # are.
 _LAYERS = re.compile(
@@ -180,7 +183,16 @@ def _workspaces(path: Path) -> list[_Workspace]:
         elif not workspace and (path / "distorted/sparse").is_dir():
             beside.remove("input")  # what its images were made of
         found += [_Workspace(f, tuple(beside)) for f in folders if model_files(f)]
-    return found
+    # Of any name, if nothing but the model lies there: others may be captures of their own.
+    others = (f for pattern in _MODELS_BELOW for f in sorted(path.glob(pattern)) if not found)
+    return found or [_Workspace(f, _IMAGES) for f in others if _holds_a_model_alone(f)]
+
+
+def _holds_a_model_alone(folder: Path) -> bool:
+    """Whether there are neither folders nor pictures or meshes beside a model."""
+    if folder.name.startswith(".") or not model_files(folder):
+        return False
+    return all(f.is_file() and f.suffix.lower() in _BESIDE_MODELS for f in folder.iterdir())
 
 
 def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
@@ -215,10 +227,10 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
                 "with 'colmap mapper', and name the folder that holds what it writes. "
                 "[colmap.model]"
             )
-        raise InputRefused(
-            f"{where}. Put the model in sparse/0 and the images in images/, or name their folder "
-            "with --frames. [colmap.images]"
-        )
+        cure = "Put the model in sparse/0 and the images in images/"
+        above = _images_above(path, first)
+        cure = f"Name {above}, where they are" if above else f"{cure}, or name theirs by --frames"
+        raise InputRefused(f"{where}. {cure}. [colmap.images]")
     fitting = [c for c in candidates if _images_fit(pictured, c, candidates)]
     chosen = (fitting or candidates)[0]
     parts = [c for c in candidates if c.images == chosen.images]
@@ -230,6 +242,12 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
             f"{len(largest.model.names)}. [colmap.model]"
         )
     return largest
+
+
+def _images_above(path: Path, image: str) -> Path | None:
+    """The folder above a model's that holds its images in a usual place."""
+    above = path.parents[:2] if image else ()
+    return next((p for p in above if any((p / f / image).is_file() for f in _IMAGES)), None)
 
 
 def _of_full_size(counts: dict[str, int]) -> dict[str, int]:
