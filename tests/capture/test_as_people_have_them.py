@@ -247,6 +247,19 @@ def test_what_a_camera_wrote_need_not_be_there_but_may(made):
     assert _read(made).frames.radiometric
 
 
+@pytest.mark.parametrize("suffix", ["HEIC", "exr", "hdr", "tif"])
+def test_a_jpeg_of_another_name_is_a_photograph(made, suffix):
+    """As telephones and messengers hand them on; it passed for radiance."""
+    _as_photographs(made, ".jpg")
+    for i in range(12):
+        photograph = made.folder / f"photographs/{i:04d}.jpg"
+        photograph.rename(photograph.with_suffix(f".{suffix}"))
+    _rename(made, f"photographs/{{:04d}}.{suffix}")
+    with pytest.raises(InputRefused, match=r"--assume-srgb"):
+        _read(made)
+    assert not _read(made, assume_srgb=True).frames.radiometric
+
+
 @pytest.mark.parametrize("depths", [".exr", ".png", ".tif"])
 def test_depths_beside_a_picture_are_not_what_is_meant(made, depths):
     """By a camera's file, of which a JPEG was made, or by a name or a number alone."""

@@ -20,6 +20,7 @@ from usdbrdf.files.images import (
     colour_tag,
     holds_whole_numbers,
     image_size,
+    is_jpeg_or_png,
     orientation_of,
     white_of_mask,
 )
@@ -231,7 +232,10 @@ _TIFF = " as whole numbers, unless --input-space says that they are linear or lo
 
 
 def _is_photograph(path: Path) -> bool:
-    return path.suffix.lower() in PHOTOGRAPH_SUFFIXES
+    """By its name or, as telephones call JPEGs .HEIC and people anything .exr, by what it is."""
+    with suppress(ImageRefused):  # of which the reader of its pixels will tell
+        return path.suffix.lower() in PHOTOGRAPH_SUFFIXES or is_jpeg_or_png(path)
+    return False
 
 
 def _is_whole_tiff(path: Path) -> bool:

@@ -173,6 +173,11 @@ def stored_space(path: Path) -> tuple[str, int]:
     return str(spec.getattribute("oiio:ColorSpace") or ""), int(spec.nchannels)
 
 
+def is_jpeg_or_png(path: Path) -> bool:
+    """Whether the image is one of these, whatever its name says, from the header alone."""
+    return open_image(path).format_name() in ("jpeg", "png")
+
+
 def is_eight_bit(path: Path) -> bool:
     """Whether the image holds bytes, from the header alone."""
     return str(open_image(path).spec().format) == "uint8"
