@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.lens_scenes import CAMERAS, camera_of, capture_through, seen_through
 from tests.scenes import edited, make_capture, write_ply
@@ -244,6 +245,26 @@ def test_a_model_without_points_and_with_colmaps_own_mesh_and_masks(tmp_path):
     assert [view is not None for view in scan.views] == [i in (3, 5, 7) for i in range(10)]
     assert any("[colmap.scale]" in warning for warning in scan.warnings)
     assert any("3 masks" in warning for warning in scan.warnings)
+
+
+@pytest.mark.parametrize(
+    ("scale", "degrees", "elsewhere"), [(1, 0, False), (1.3, 0, True), (1, 30, True)]
+)
+def test_a_mesh_off_the_points_of_the_model_is_told(tmp_path, scale, degrees, elsewhere):
+    """As of another program, or aligned since; cameras inside of it hit it anyhow."""
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    model = pycolmap.Reconstruction(made.folder / "sparse/0")
+    corners = made.points[made.triangles[:: len(made.triangles) // 100]].astype(np.float64)
+    for place in corners.mean(axis=1):
+        model.add_point3D(place + 0.01, pycolmap.Track(), np.zeros(3, np.uint8))
+    write_model(made.folder / "sparse/0", model)
+    middle = made.points.mean(axis=0)
+    turn = Rotation.from_euler("xyz", [degrees, 0, degrees], degrees=True).as_matrix()
+    points = scale * (made.points - middle) @ turn.T + middle
+    write_ply(made.folder / "mesh.ply", points, made.triangles, made.face_object)
+    told = [s for s in read_scan(made.folder, OPTIONS).warnings if "[mesh.frame]" in s]
+    assert len(told) == elsewhere
+    assert all("half of the points of COLMAP's model lie farther off" in said for said in told)
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,7 @@ from usdbrdf.capture.formats.named_pictures import (
     path_in_capture,
     scan_of,
 )
+from usdbrdf.capture.mesh_frames import why_elsewhere
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -44,6 +45,7 @@ from usdbrdf.files.images import image_size
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
+from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import ColmapCamera, ColmapModel, colmap_model, model_files
 
@@ -94,15 +96,18 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             f"{up_axis}. State them with --meters-per-unit and --up-axis. [colmap.scale]"
         )
     objects = path_in_capture(path, "objects.json", options)
+
+    def geometry() -> ScanGeometry:
+        mesh = options.mesh or _mesh(path, options)
+        labels = options.objects or (objects if objects.is_file() else None)
+        found = geometry_from_file(mesh, labels, options, findings, capture_root=path)
+        if why := why_elsewhere(found.mesh, chosen.folder):
+            findings.warn(f"{mesh.name}: {why}. [mesh.frame]")
+        return found
+
     return scan_of(
         records,
-        lambda: geometry_from_file(
-            options.mesh or _mesh(path, options),
-            options.objects or (objects if objects.is_file() else None),
-            options,
-            findings,
-            capture_root=path,
-        ),
+        geometry,
         options,
         findings,
         adapter=NAME,
