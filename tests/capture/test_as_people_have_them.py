@@ -14,8 +14,9 @@ import pytest
 from tests.scenes import MadeCapture, edited, make_capture, write_ply
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.formats.named_pictures import Pictures, pictures_of
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.colour import to_display_srgb8
+from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr, white_of_mask
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import IngestOptions
@@ -321,6 +322,25 @@ def test_tiff_of_whole_numbers_is_a_photograph_unless_its_space_is_stated(made):
     assert (taken.radiometric, taken.encoding) == (False, "srgb_rec709_scene")
     stated = _read(made, encoding="lin_rec2020_scene").frames
     assert (stated.radiometric, stated.encoding) == (True, "lin_rec2020_scene")
+
+
+def test_png_of_16_bits_is_linear_if_that_is_stated(made):
+    """As raw developers write it; of 8 bits it is a photograph whatever is said."""
+    for i in range(12):
+        pixels = np.round(65535 * np.clip(read_exr(made.image(i)), 0, 1)).astype(np.uint16)
+        _write_bytes(made.folder / f"photographs/{i:04d}.png", pixels)
+    _rename(made, "photographs/{:04d}.png")
+    with pytest.raises(InputRefused, match=r"PNG.*--input-space.*\[capture\.ldr\]$"):
+        _read(made)
+    assert not _read(made, assume_srgb=True).frames.radiometric
+    frames = _read(made, encoding="lin_rec709_scene").frames
+    assert (frames.radiometric, frames.encoding) == (True, "lin_rec709_scene")
+    shown = read_frame(frames, 3)
+    expected = read_exr(made.image(3))
+    np.testing.assert_allclose(shown.radiance[shown.valid], expected[shown.valid], atol=1e-4)
+    _as_photographs(made, ".png")
+    with pytest.raises(UsageError, match="8-bit photographs"):
+        _read(made, encoding="lin_rec709_scene", assume_srgb=True)
 
 
 def test_masks_have_suffixes_of_any_case(made):

@@ -20,6 +20,7 @@ from usdbrdf.files.images import (
     colour_tag,
     holds_whole_numbers,
     image_size,
+    is_eight_bit,
     is_jpeg_or_png,
     orientation_of,
     white_of_mask,
@@ -206,10 +207,10 @@ def refuse_photographs(
     """True where all images are low dynamic range, False where none is; InputRefused otherwise.
 
     Photographs hold display values, not radiance: they are used only if the user says so. So do
-    TIFF files of whole numbers, unless their ``encoding`` is stated to be another.
+    TIFF of whole numbers and PNG of 16 bits, unless their ``encoding`` is stated to be another.
     """
     said = encoding is not None and kind_of_encoding(encoding) != "display"
-    photographs = [p for p in paths if _is_photograph(p) or (not said and _is_whole_tiff(p))]
+    photographs = [p for p in paths if _is_photograph(p) and not (said and _may_be_radiance(p))]
     if not photographs:
         return False
     if len(photographs) < len(paths):
@@ -221,26 +222,30 @@ def refuse_photographs(
     if not assume_srgb:
         kind = photographs[0].suffix[1:].upper()
         raise InputRefused(
-            f"{photographs[0]}: {len(photographs)} frames are {kind}, which does not hold "
-            f"radiance{_TIFF if _is_whole_tiff(photographs[0]) else ''}. Export scene-linear EXR, "
-            "or accept a result that is not radiometric with --assume-srgb. [capture.ldr]"
+            f"{photographs[0]}: {len(photographs)} frames are {kind}, which does not hold radiance"
+            f"{_UNLESS if _may_be_radiance(photographs[0]) else ''}. Export scene-linear EXR, or "
+            "accept a result that is not radiometric with --assume-srgb. [capture.ldr]"
         )
     return True
 
 
-_TIFF = " as whole numbers, unless --input-space says that they are linear or logarithms"
+_UNLESS = " as whole numbers, unless --input-space says that they are linear or logarithms"
 
 
 def _is_photograph(path: Path) -> bool:
     """By its name or, as telephones call JPEGs .HEIC and people anything .exr, by what it is."""
     with suppress(ImageRefused):  # of which the reader of its pixels will tell
-        return path.suffix.lower() in PHOTOGRAPH_SUFFIXES or is_jpeg_or_png(path)
+        named = path.suffix.lower() in PHOTOGRAPH_SUFFIXES
+        return named or is_jpeg_or_png(path) or _may_be_radiance(path)
     return False
 
 
-def _is_whole_tiff(path: Path) -> bool:
-    with suppress(ImageRefused):  # of which the reader of its pixels will tell
-        return path.suffix.lower() in (".tif", ".tiff") and holds_whole_numbers(path)
+def _may_be_radiance(path: Path) -> bool:
+    """Whether it is TIFF of whole numbers or PNG of 16 bits, which raw developers write linear."""
+    with suppress(ImageRefused):
+        if path.suffix.lower() in (".tif", ".tiff"):
+            return holds_whole_numbers(path)
+        return path.suffix.lower() == ".png" and not is_eight_bit(path)
     return False
 
 
