@@ -343,6 +343,18 @@ def test_png_of_16_bits_is_linear_if_that_is_stated(made):
         _read(made, encoding="lin_rec709_scene", assume_srgb=True)
 
 
+def test_frames_that_cannot_be_read_for_several_reasons_are_not_told_of_one(made):
+    """The first's stood for all; and grey pictures have no beauty pass to export."""
+    made.image(2).write_bytes(b"")
+    grey = read_exr(made.image(3))[..., :1]
+    _write_named(made.image(3), grey, ["Y"])
+    (told,) = [s for s in _read(made).warnings if "2 of 12 frames dropped" in s]
+    assert ": the first, as " in told
+    made.image(2).write_bytes(made.image(3).read_bytes())
+    (told,) = [s for s in _read(made).warnings if "2 of 12 frames dropped" in s]
+    assert "'frames/0003.exr': a grey picture. Export it in colour. [capture.image]" in told
+
+
 def test_masks_have_suffixes_of_any_case(made):
     pytest.importorskip("pycolmap")
     names = [f"{i:04d}.exr" for i in range(12)]

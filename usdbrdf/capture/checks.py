@@ -184,9 +184,10 @@ class Findings:
             self.count("frames_dropped", len(frames))
             names = ", ".join(repr(frame.name) for frame in frames[:3])
             more = f" and {len(frames) - 3} more" if len(frames) > 3 else ""
+            whose = "" if len({frame.reason for frame in frames}) == 1 else "the first, as "
             self.warn(
                 f"{source.name}: {len(frames)} of {total} frames dropped, {names}{more}: "
-                f"{frames[0].reason}. [{rule}]"
+                f"{whose}{frames[0].reason}. [{rule}]"
             )
 
     def _by_rule(self) -> dict[str, list[DroppedFrame]]:
@@ -221,15 +222,13 @@ def refuse_photographs(
         )
     if not assume_srgb:
         kind = photographs[0].suffix[1:].upper()
+        unless = " as whole numbers, unless --input-space says that they are linear or logarithms"
         raise InputRefused(
             f"{photographs[0]}: {len(photographs)} frames are {kind}, which does not hold radiance"
-            f"{_UNLESS if _may_be_radiance(photographs[0]) else ''}. Export scene-linear EXR, or "
+            f"{unless * _may_be_radiance(photographs[0])}. Export scene-linear EXR, or "
             "accept a result that is not radiometric with --assume-srgb. [capture.ldr]"
         )
     return True
-
-
-_UNLESS = " as whole numbers, unless --input-space says that they are linear or logarithms"
 
 
 def _is_photograph(path: Path) -> bool:
