@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -23,19 +24,26 @@ _ON_IT, _CLEARLY = 0.1, 3.0
 _FITS = 0.05
 
 
-def lies_with_points(mesh: Path, model: Path, moved: Double) -> bool | None:
-    """Whether a mesh lies where the points of a COLMAP model lie (True), or where ``moved``, a
-    similarity (4, 4), takes them (False); None where they do not tell, or cannot be read."""
+class Lies(NamedTuple):
+    """Where a mesh lies: on the points of a COLMAP model (True), or where these are moved to
+    (False), None where they do not tell; and whether it is known to lie on neither."""
+
+    with_points: bool | None
+    elsewhere: bool
+
+
+def lies_with_points(mesh: Path, model: Path, moved: Double) -> Lies:
+    """Which it is of a mesh, ``moved`` being a similarity (4, 4)."""
     points = _points(model)
     if points is None:
-        return None
+        return Lies(None, elsewhere=False)
     found = mesh_from_file(mesh)
     surface = cKDTree(_places_on(found.points, found.triangles))
     here = _off(surface, points)
     there = _off(surface, points @ moved[:3, :3].T + moved[:3, 3])
     if min(here, there) > _ON_IT or max(here, there) < _CLEARLY * min(here, there):
-        return None
-    return here < there
+        return Lies(None, elsewhere=min(here, there) > _ON_IT)
+    return Lies(here < there, elsewhere=False)
 
 
 def why_elsewhere(mesh: ScanMesh, model: Path) -> str:

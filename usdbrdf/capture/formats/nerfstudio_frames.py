@@ -23,7 +23,7 @@ from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.formats.colmap import world_from_camera
 from usdbrdf.capture.formats.named_pictures import rigid_pose
-from usdbrdf.capture.mesh_frames import lies_with_points
+from usdbrdf.capture.mesh_frames import Lies, lies_with_points
 from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.documents import read_json
@@ -235,7 +235,11 @@ def _home_of_colmaps(
     name = model.relative_to(folder).as_posix()
     if np.array_equal(moved, np.eye(4)):
         stored = applied.similarity
-        if np.array_equal(stored, np.eye(4)) or lies_with_points(mesh, model, stored) is not False:
+        if np.array_equal(stored, np.eye(4)):
+            return None
+        lies = lies_with_points(mesh, model, stored)
+        if lies.with_points is not False:
+            _warn_of_elsewhere(mesh, name, lies, findings)
             return None
         findings.warn(
             f"{mesh.name}: lies in the frame of the document's poses, by the points of the model "
@@ -243,22 +247,32 @@ def _home_of_colmaps(
         )
         return np.asarray(np.linalg.inv(stored), np.float64)
     lies = lies_with_points(mesh, model, moved)
-    if lies is False:
+    if lies.with_points is False:
         if of_colmap:
             findings.warn(
                 f"{mesh.name}: is called as COLMAP's meshes, but lies in the frame of the poses "
                 f"already, by the points of the model {name}; it stays there. [mesh.frame]"
             )
         return np.eye(4)
-    if lies is None and not of_colmap:
+    if lies.with_points is None and not of_colmap:
+        _warn_of_elsewhere(mesh, name, lies, findings)
         return None
-    how = "lies" if lies else "is called as COLMAP's meshes, which lie"
-    doubt = "" if lies else " Rename it if it lies there already."
+    how = "lies" if lies.with_points else "is called as COLMAP's meshes, which lie"
+    doubt = "" if lies.with_points else " Rename it if it lies there already."
     findings.warn(
         f"{mesh.name}: {how} in the frame of COLMAP's model {name}; it is brought to that of the "
         f"poses, by the cameras of both.{doubt} [mesh.frame]"
     )
     return moved
+
+
+def _warn_of_elsewhere(mesh: Path, model: str, lies: Lies, findings: Findings) -> None:
+    if lies.elsewhere:
+        findings.warn(
+            f"{mesh.name}: lies neither on the points of the model {model} nor where the poses "
+            "have these, so it is but a part of what the photographs show, or lies in a frame or "
+            "unit of its own. Make one of this model if it does. [mesh.frame]"
+        )
 
 
 def _capture_from_colmap(
