@@ -352,7 +352,7 @@ def test_frames_that_cannot_be_read_for_several_reasons_are_not_told_of_one(made
     assert ": the first, as " in told
     made.image(2).write_bytes(made.image(3).read_bytes())
     (told,) = [s for s in _read(made).warnings if "2 of 12 frames dropped" in s]
-    assert "'frames/0003.exr': a grey picture. Export it in colour. [capture.image]" in told
+    assert "'Y'. It is grey: export it in colour. [capture.image]" in told
 
 
 def test_masks_have_suffixes_of_any_case(made):

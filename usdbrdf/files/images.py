@@ -80,9 +80,9 @@ def _radiance(path: Path, max_side: int, alpha: bool) -> Float:
                 f"{len(colours)} {have} R, G and B ({names}), and not one of them alone is "
                 "called beauty or Combined"
             )
-        if set(source.spec().channelnames) <= {"Y", "A"}:
-            raise ImageRefused(f"{path}: a grey picture. Export it in colour. [image.channels]")
-        raise ImageRefused(f"{path}: {said}. Export the beauty pass as R, G, B. [image.channels]")
+        grey = set(source.spec().channelnames) <= {"Y", "A"}
+        cure = "It is grey: export it in colour" if grey else "Export the beauty pass as R, G, B"
+        raise ImageRefused(f"{path}: {said}. {cure}. [image.channels]")
     channels = [colours[letter] for letter in ("rgba" if alpha else "rgb") if letter in colours]
     pixels = pixels_of(path, source)
     if channels != list(range(pixels.shape[2])):
