@@ -240,6 +240,7 @@ ENGINEERING: dict[str, str] = {
     "_FINER": "steps of a search",
     "_FIRST_GUESS": "start and end of a search",
     "_FIRST_RAYS": "rays: noise against time",
+    "_FITS": "from here on a warning is printed",
     "_FLIP": "convention of a format",
     "_FOCAL_LENGTHS": "limit of what is refused",
     "_FOLLOWED": "memory",

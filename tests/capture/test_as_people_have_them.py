@@ -14,8 +14,9 @@ import pytest
 from tests.scenes import MadeCapture, edited, make_capture, write_ply
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.formats.named_pictures import Pictures, pictures_of
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.colour import to_display_srgb8
+from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr, white_of_mask
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import IngestOptions
@@ -247,6 +248,19 @@ def test_what_a_camera_wrote_need_not_be_there_but_may(made):
     assert _read(made).frames.radiometric
 
 
+@pytest.mark.parametrize("suffix", ["HEIC", "exr", "hdr", "tif"])
+def test_a_jpeg_of_another_name_is_a_photograph(made, suffix):
+    """As telephones and messengers hand them on; it passed for radiance."""
+    _as_photographs(made, ".jpg")
+    for i in range(12):
+        photograph = made.folder / f"photographs/{i:04d}.jpg"
+        photograph.rename(photograph.with_suffix(f".{suffix}"))
+    _rename(made, f"photographs/{{:04d}}.{suffix}")
+    with pytest.raises(InputRefused, match=r"--assume-srgb"):
+        _read(made)
+    assert not _read(made, assume_srgb=True).frames.radiometric
+
+
 @pytest.mark.parametrize("depths", [".exr", ".png", ".tif"])
 def test_depths_beside_a_picture_are_not_what_is_meant(made, depths):
     """By a camera's file, of which a JPEG was made, or by a name or a number alone."""
@@ -308,6 +322,37 @@ def test_tiff_of_whole_numbers_is_a_photograph_unless_its_space_is_stated(made):
     assert (taken.radiometric, taken.encoding) == (False, "srgb_rec709_scene")
     stated = _read(made, encoding="lin_rec2020_scene").frames
     assert (stated.radiometric, stated.encoding) == (True, "lin_rec2020_scene")
+
+
+def test_png_of_16_bits_is_linear_if_that_is_stated(made):
+    """As raw developers write it; of 8 bits it is a photograph whatever is said."""
+    for i in range(12):
+        pixels = np.round(65535 * np.clip(read_exr(made.image(i)), 0, 1)).astype(np.uint16)
+        _write_bytes(made.folder / f"photographs/{i:04d}.png", pixels)
+    _rename(made, "photographs/{:04d}.png")
+    with pytest.raises(InputRefused, match=r"PNG.*--input-space.*\[capture\.ldr\]$"):
+        _read(made)
+    assert not _read(made, assume_srgb=True).frames.radiometric
+    frames = _read(made, encoding="lin_rec709_scene").frames
+    assert (frames.radiometric, frames.encoding) == (True, "lin_rec709_scene")
+    shown = read_frame(frames, 3)
+    expected = read_exr(made.image(3))
+    np.testing.assert_allclose(shown.radiance[shown.valid], expected[shown.valid], atol=1e-4)
+    _as_photographs(made, ".png")
+    with pytest.raises(UsageError, match="8-bit photographs"):
+        _read(made, encoding="lin_rec709_scene", assume_srgb=True)
+
+
+def test_frames_that_cannot_be_read_for_several_reasons_are_not_told_of_one(made):
+    """The first's stood for all; and grey pictures have no beauty pass to export."""
+    made.image(2).write_bytes(b"")
+    grey = read_exr(made.image(3))[..., :1]
+    _write_named(made.image(3), grey, ["Y"])
+    (told,) = [s for s in _read(made).warnings if "2 of 12 frames dropped" in s]
+    assert ": the first, as " in told
+    made.image(2).write_bytes(made.image(3).read_bytes())
+    (told,) = [s for s in _read(made).warnings if "2 of 12 frames dropped" in s]
+    assert "'Y'. It is grey: export it in colour. [capture.image]" in told
 
 
 def test_masks_have_suffixes_of_any_case(made):

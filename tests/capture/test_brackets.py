@@ -19,8 +19,9 @@ from usdbrdf.capture.brackets import Merged, merge, response_from_brackets
 from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
+from usdbrdf.files.exif import exif_exposure
 from usdbrdf.files.frames import read_frame
-from usdbrdf.files.images import exif_exposure, read_exr, write_preview_png
+from usdbrdf.files.images import read_exr, write_preview_png
 from usdbrdf.options import IngestOptions
 
 EXPOSURES = 16 * 4.0 ** -np.arange(9.0)
@@ -362,7 +363,7 @@ def test_what_is_told_of_a_folder_names_it_and_no_document_that_is_not_there(tmp
     assert told == [line for line in told if f"{folder}: " in line] != []
 
 
-@pytest.mark.parametrize("profile", ["Adobe RGB (1998)", "ProPhoto RGB", "sRGB IEC61966-2.1"])
+@pytest.mark.parametrize("profile", ["ColorMatch RGB", "ProPhoto RGB", "sRGB IEC61966-2.1"])
 def test_a_profile_that_is_not_known_is_told(tmp_path, monkeypatch, capsys, profile):
     pytest.importorskip("cv2", reason="needs usdbrdf[brackets]")
     folder = tmp_path / "stack"

@@ -11,6 +11,7 @@ import pytest
 
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import encoding_of_tag
 from usdbrdf.files.frames import PHOTOGRAPH_SATURATION, read_frame
 from usdbrdf.files.images import read_radiance
@@ -66,11 +67,54 @@ def test_the_document_and_the_user_come_before_the_header(capture):
     assert read_scan(capture.folder, IngestOptions()).frames.encoding == "lin_rec709_scene"
 
 
-def test_a_header_that_says_nothing_known_changes_nothing(capture):
+def test_a_header_that_says_nothing_known_changes_nothing_and_that_is_told(capture):
     _tag(capture, chromaticities=(0.6, 0.3, 0.3, 0.5, 0.1, 0.1, 0.3, 0.3))
     scan = read_scan(capture.folder, IngestOptions())
     assert scan.frames.encoding == "lin_rec709_scene"
-    assert not any("[capture.encoding]" in sentence for sentence in scan.warnings)
+    (told,) = [sentence for sentence in scan.warnings if "[capture.encoding]" in sentence]
+    assert "12 images say that their primaries and white are 0.6, 0.3, 0.3" in told
+
+
+def test_images_of_several_colour_spaces_are_refused(capture):
+    """As of two cameras, or of those that somebody has edited; the first stood for all."""
+    last = capture.image(11)
+    kept = last.read_bytes()
+    _tag(capture, chromaticities=AP1)
+    last.write_bytes(kept)
+    with pytest.raises(InputRefused, match=r"'0000.exr' is lin_ap1_scene, '0011.exr' lin_rec709"):
+        read_scan(capture.folder, IngestOptions())
+    own = read_scan(capture.folder, IngestOptions(encoding="lin_ap1_scene"))
+    assert own.frames.encoding == "lin_ap1_scene"
+
+
+def _as_radiance_hdr(capture, lines):
+    """All frames again as Radiance's files, each with its lines of a header."""
+    with edited(capture.folder / "transforms.json") as document:
+        for i, frame in enumerate(document["frames"]):
+            file = capture.image(i).with_suffix(".hdr")
+            spec = oiio.ImageSpec(32, 24, 3, "float")
+            output = oiio.ImageOutput.create(str(file))
+            assert output.open(str(file), spec)
+            assert output.write_image(read_radiance(capture.image(i)))
+            assert output.close()
+            head, blank, rest = file.read_bytes().partition(b"\n\n")
+            file.write_bytes(head + b"\n" + lines(i) + blank + rest)
+            frame["file_path"] = f"frames/{file.name}"
+
+
+def test_what_a_radiance_file_has_been_multiplied_by_is_divided_out(capture):
+    """Its EXPOSURE and COLORCORR, each stated as often as it was done."""
+    before = read_frame(read_scan(capture.folder, IngestOptions()).frames, 3).radiance
+    _as_radiance_hdr(capture, lambda i: b"EXPOSURE=4\nCOLORCORR= 1 2 1\nEXPOSURE= %g" % (1 + i))
+    scan = read_scan(capture.folder, IngestOptions())
+    found = read_frame(scan.frames, 3).radiance
+    np.testing.assert_allclose(found, before / (16, 32, 16), rtol=0.02)
+
+
+def test_the_primaries_of_a_radiance_file_are_known(capture):
+    said = b"PRIMARIES=.68 .32 .265 .69 .15 .06 .3127 .329"
+    _as_radiance_hdr(capture, lambda i: said)
+    assert read_scan(capture.folder, IngestOptions()).frames.encoding == "lin_p3d65_scene"
 
 
 def _profile(name: str) -> np.ndarray:
@@ -90,7 +134,7 @@ def _profile(name: str) -> np.ndarray:
     ("profile", "encoding"),
     [
         ("Display P3", "srgb_p3d65_scene"),
-        ("Adobe RGB (1998)", "srgb_rec709_scene"),
+        ("Adobe RGB (1998)", "g22_adobergb_scene"),
         ("sRGB IEC61966-2.1", "srgb_rec709_scene"),
         ("ProPhoto RGB", "srgb_rec709_scene"),
     ],
@@ -133,7 +177,8 @@ def test_photographs_have_the_space_of_the_profile_in_them(capture, profile, enc
         ("srgb_p3d65_scene", "srgb_p3d65_scene"),  # of OpenColorIO
         ("srgb_ap1_scene", "srgb_ap1_scene"),
         ("sRGB-elle-V2-g10.icc", None),
-        ("Adobe RGB (1998)", None),
+        ("Adobe RGB (1998)", "g22_adobergb_scene"),
+        ("Compatible with Adobe RGB (1998)", "g22_adobergb_scene"),
     ],
 )
 def test_profiles_are_known_by_any_of_their_names(profile, encoding):

@@ -463,6 +463,21 @@ def test_a_whole_sphere_by_the_key_that_instant_ngp_has_for_it(tmp_path):
     assert {record.lens.curve for record in records} == {"equirectangular"}
 
 
+def test_a_fisheye_ends_at_the_circle_that_a_document_states(tmp_path):
+    """nerfstudio's fisheye_crop_radius, in pixels: beyond it is the lens's tube."""
+    made = capture_through(tmp_path / "room", "OPENCV_FISHEYE")
+    with edited(made.manifest) as document:
+        document["fisheye_crop_radius"] = 15
+    shown = read_scan(made.folder, IngestOptions()).views
+    fx, fy, cx, cy = shown[0].intrinsics
+    angles = np.linspace(0, 1.2, 200)
+    directions = np.stack([np.sin(angles), 0 * angles, -np.cos(angles)], axis=-1)
+    reached = shown[0].lens.project(directions, (fx, fy, cx, cy))[:, 0] - cx
+    assert 14.8 < np.nanmax(reached) <= 15
+    assert np.isnan(reached).any()
+    assert "circle 0.75" in shown[0].lens.described((fx, fy, cx, cy))
+
+
 def test_lenses_of_documents_and_of_single_frames(tmp_path):
     made = make_capture(tmp_path / "room")
     small = (-0.02, 0.01, 0.003, 0.002, -0.001, 0.004, 0.001, -0.002, 0.003, 0.001, 0.002, -0.001)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 
 from usdbrdf.capture import mesh_frames
@@ -21,11 +18,8 @@ def test_places_are_everywhere_and_not_all_corners(monkeypatch):
     a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
     quads = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     of_wall = np.array([[0, 1, 2], [0, 2, 3]]) + side**2
-    mesh: Any = SimpleNamespace(
-        points=np.concatenate([thing, wall]).astype(np.float32),
-        triangles=np.concatenate([quads, of_wall]).astype(np.int32),
-    )
-    places = mesh_frames._places_on(mesh)
+    points = np.concatenate([thing, wall]).astype(np.float32)
+    places = mesh_frames._places_on(points, np.concatenate([quads, of_wall]).astype(np.int32))
     assert len(places) < mesh_frames._PLACES + 3 * 100
     # Nine tenths of the area.
     assert abs((places[:, 2] < -0.5).mean() - 0.9) < 0.01

@@ -236,6 +236,19 @@ def test_the_points_of_the_model_tell_in_which_frame_a_mesh_lies(capture, folder
         assert ["it stays there" in said for said in told] == [True] * (name != "mesh.ply")
 
 
+def test_a_mesh_in_a_frame_of_its_own_is_told(capture):
+    """Neither COLMAP's nor that of the poses; cameras inside of it hit it anyhow."""
+    similarity = np.eye(4)
+    similarity[:3, :3] = 0.4 * Rotation.from_euler("xyz", [70, 10, -50], degrees=True).as_matrix()
+    corners = capture.points[capture.triangles[:: len(capture.triangles) // 100]]
+    _recentred(capture, "colmap_text", similarity=similarity, points=corners.mean(axis=1))
+    (capture.folder / "objects.json").unlink()
+    own = np.array([3.0, 2.0, 1.0]) - capture.points
+    write_ply(capture.folder / "mesh.ply", 2 * own[:, [2, 0, 1]], capture.triangles)
+    told = read_scan(capture.folder, IngestOptions()).warnings
+    assert any("lies neither on the points of the model colmap_text nor" in said for said in told)
+
+
 def test_points_that_cannot_be_read_cost_nothing_but_what_they_tell(capture):
     """As where Git LFS has fetched the cameras alone: captures were refused that need no points."""
     similarity = np.eye(4)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.lens_scenes import CAMERAS, camera_of, capture_through, seen_through
 from tests.scenes import edited, make_capture, write_ply
@@ -247,6 +248,26 @@ def test_a_model_without_points_and_with_colmaps_own_mesh_and_masks(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("scale", "degrees", "elsewhere"), [(1, 0, False), (1.3, 0, True), (1, 30, True)]
+)
+def test_a_mesh_off_the_points_of_the_model_is_told(tmp_path, scale, degrees, elsewhere):
+    """As of another program, or aligned since; cameras inside of it hit it anyhow."""
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    model = pycolmap.Reconstruction(made.folder / "sparse/0")
+    corners = made.points[made.triangles[:: len(made.triangles) // 100]].astype(np.float64)
+    for place in corners.mean(axis=1):
+        model.add_point3D(place + 0.01, pycolmap.Track(), np.zeros(3, np.uint8))
+    write_model(made.folder / "sparse/0", model)
+    middle = made.points.mean(axis=0)
+    turn = Rotation.from_euler("xyz", [degrees, 0, degrees], degrees=True).as_matrix()
+    points = scale * (made.points - middle) @ turn.T + middle
+    write_ply(made.folder / "mesh.ply", points, made.triangles, made.face_object)
+    told = [s for s in read_scan(made.folder, OPTIONS).warnings if "[mesh.frame]" in s]
+    assert len(told) == elsewhere
+    assert all("half of the points of COLMAP's model lie farther off" in said for said in told)
+
+
+@pytest.mark.parametrize(
     ("turn", "axis", "upright"),
     [
         (np.eye(3), "Z", ""),
@@ -379,11 +400,50 @@ def test_old_documents_of_nerfstudio_had_turned_the_world(tmp_path):
     assert any("[capture.legacy]" in warning for warning in scan.warnings)
 
 
+@pytest.mark.parametrize("old", [True, False])
+def test_the_model_beside_a_document_tells_whether_its_world_was_turned(tmp_path, old):
+    """Documents without applied_transform that other programs write lie as the model does."""
+    made = make_capture(tmp_path / "room")
+    camera = pycolmap.Camera(model="PINHOLE", width=32, height=24, params=[19.2, 19.2, 16, 12])
+    names = [f"{i:04d}.png" for i in range(12)]
+    write_model(made.folder / "colmap/sparse/0", reconstruction(made, [camera], names))
+    legacy = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    with edited(made.manifest) as document:
+        for frame in document["frames"] if old else ():
+            frame["transform_matrix"] = (legacy @ frame["transform_matrix"]).tolist()
+    scan = read_scan(made.folder, OPTIONS)
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera, atol=1e-9)
+    told = [sentence for sentence in scan.warnings if "[capture.legacy]" in sentence]
+    assert ["state applied_transform" in sentence for sentence in told] == [False] * old
+
+
 def _images_through(made, folder, model, scale=1):
     camera = camera_of(model, scale)
     folder.mkdir(parents=True)
     for i in range(10):
         write_exr(folder / f"{i:04d}.exr", seen_through(camera, made.world_from_camera[i], made))
+
+
+@pytest.mark.parametrize("folder", ["sparse_txt", "model", "sparse/final", "sparse/0/text"])
+def test_a_folder_of_a_model_alone_may_be_called_anything(tmp_path, folder):
+    made = colmap_capture(tmp_path / "room", "PINHOLE", text="t" in folder, sparse=folder)
+    assert choose_adapter(made.folder).name == "colmap"
+    scan = read_scan(made.folder, OPTIONS)
+    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera, atol=1e-9)
+
+
+def test_a_folder_that_holds_several_captures_is_none(tmp_path):
+    """Each has its images beside its model."""
+    colmap_capture(tmp_path / "rooms" / "one", "PINHOLE", sparse="")
+    with pytest.raises(InputRefused, match=r"one/ in it is one \(colmap\)"):
+        choose_adapter(tmp_path / "rooms")
+
+
+@pytest.mark.parametrize("named", ["sparse", "sparse/0"])
+def test_the_model_alone_says_which_folder_holds_its_images(tmp_path, named):
+    made = colmap_capture(tmp_path / "room", "PINHOLE")
+    with pytest.raises(InputRefused, match=rf"Name {made.folder}, where they are\. \[colmap"):
+        read_scan(made.folder / named, OPTIONS)
 
 
 @pytest.fixture

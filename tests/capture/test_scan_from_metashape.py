@@ -115,6 +115,40 @@ def test_cameras_of_a_chunk(project, room):
     assert (scan.adapter, scan.up_axis, scan.meters_per_unit) == ("metashape", "Z", 1.0)
 
 
+@pytest.mark.parametrize("placed", [True, False])
+def test_cameras_of_a_component_that_was_not_aligned_with_the_others_are_left_out(
+    tmp_path, room, placed
+):
+    """Each component that is not placed has coordinates of its own."""
+    document, sensors, cameras = _chunk(component=True)
+    _sensor(sensors, 0, **_lens(room))
+    parts = document.find("chunk/components")
+    _child(parts, "component", id="6")
+    if not placed:
+        (first,) = parts.iterfind("component[@id='5']")
+        first.remove(first.find("transform"))
+    for i, pose in enumerate(room.opencv):
+        own = _in_chunk(pose) if placed else pose
+        own = own if i < 9 else np.eye(4)
+        ids = {"id": str(i), "sensor_id": "0", "component_id": "56"[i == 9]}
+        camera = _child(cameras, "camera", label=f"DSC{i:04d}", **ids)
+        _child(camera, "transform", _text(own))
+    scan = read_scan(_write(tmp_path / "project", document, room), OPTIONS)
+    assert_same(scan, room, poses=room.world_from_camera[:9])
+    assert any("'6' stands nowhere among the others" in sentence for sentence in scan.warnings)
+
+
+def test_a_component_says_where_it_stands_before_the_chunk(tmp_path, room):
+    document, sensors, cameras = _chunk(component=True)
+    _sensor(sensors, 0, **_lens(room))
+    _child(_child(document.find("chunk"), "transform"), "scale", "1")
+    for i, pose in enumerate(room.opencv):
+        ids = {"id": str(i), "sensor_id": "0", "component_id": "5"}
+        camera = _child(cameras, "camera", label=f"DSC{i:04d}", **ids)
+        _child(camera, "transform", _text(_in_chunk(pose)))
+    assert_same(read_scan(_write(tmp_path / "project", document, room), OPTIONS), room)
+
+
 def test_an_export_may_be_called_in_capitals(project, room):
     (project / "cameras.xml").rename(project / "CAMERAS.XML")
     assert choose_adapter(project).name == "metashape"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
 
@@ -200,3 +200,21 @@ def test_cameras_within_a_scene_are_to_be_exported(tmp_path, name):
     (tmp_path / name).write_bytes(b"")
     (tmp_path / "0001.jpg").write_bytes(b"")
     assert "Export them with the mesh as USD, or bring the" in _refused(tmp_path)
+
+
+@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("capture.zip", "is an archive. Unpack it"),
+        ("scan.tar.gz", "is an archive. Unpack it"),
+        ("walk.MOV", "is a video, which does not say where its camera stood. Extract frames"),
+        ("IMG_1.HEIC", "is a picture of a kind that is not read here"),
+        ("office.las", "holds points or splats alone. Make a mesh"),
+    ],
+)
+def test_what_is_no_capture_yet_says_how_it_becomes_one(tmp_path, name, said, alone):
+    (tmp_path / name).write_bytes(b"PK\3\4" + bytes(100))
+    with pytest.raises(InputRefused) as refused:
+        choose_adapter(tmp_path / name if alone else tmp_path)
+    assert f"{name} {said}" in str(refused.value)

@@ -22,9 +22,9 @@ from usdbrdf.command_parser import _matrix
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.metrics import known_objects
 from usdbrdf.files.documents import load_arrays
+from usdbrdf.files.exif import exif_exposure
 from usdbrdf.files.images import (
     colour_tag,
-    exif_exposure,
     image_size,
     is_eight_bit,
     read_exr,
@@ -76,7 +76,7 @@ class Reader:
 
 
 _IMAGES = (
-    "usdbrdf.files.images:read_radiance,read_exr,image_size,colour_tag,exif_exposure,open_image,"
+    "usdbrdf.files.images:read_radiance,read_exr,image_size,colour_tag,open_image,"
     "_seek_colour,_check_limits,pixels_of,_in_display_window,_message,is_eight_bit,stored_space"
 )
 _DOCUMENT = "usdbrdf.files.documents:read_json,read_text,_parsed,_line_of_fault"

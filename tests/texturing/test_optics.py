@@ -48,6 +48,13 @@ def test_a_lens_without_falloff_is_left_alone():
     assert falloff_of_frames(_samples(K1, K2, points=50)) is None
 
 
+def test_more_than_lenses_do_is_none_of_their_doing():
+    """As of a mesh that does not fit, or of a lamp at the camera."""
+    found = falloff_of_frames(_samples(-2, -3))
+    assert found.stops == pytest.approx(5 / np.log(2), abs=0.2)
+    assert not found.is_clear
+
+
 def test_a_balance_that_drifts_is_found_in_its_frame():
     balance = np.ones((10, 3))
     balance[4] = (1.25, 1, 0.9)

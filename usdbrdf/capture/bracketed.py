@@ -23,20 +23,14 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.colour import encoding_of_tag, linear_space_of
 from usdbrdf.files.documents import read_json, write_json
+from usdbrdf.files.exif import exif_exposure
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, transparent_of
-from usdbrdf.files.images import (
-    colour_tag,
-    exif_exposure,
-    is_eight_bit,
-    needs_float,
-    read_radiance,
-    write_exr,
-)
+from usdbrdf.files.images import colour_tag, is_eight_bit, needs_float, read_radiance, write_exr
 from usdbrdf.files.paths import contained
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double
 
-_SPACES = ("srgb_rec709_scene", "srgb_p3d65_scene")
+_SPACES = ("srgb_rec709_scene", "srgb_p3d65_scene", "g22_adobergb_scene")
 _PHOTOGRAPHS = frozenset((".jpg", ".jpeg", ".png"))
 # Brackets that the response is told by.
 _TELLING = 12

@@ -20,6 +20,8 @@ from usdbrdf.files.images import (
     colour_tag,
     holds_whole_numbers,
     image_size,
+    is_eight_bit,
+    is_jpeg_or_png,
     orientation_of,
     white_of_mask,
 )
@@ -182,9 +184,10 @@ class Findings:
             self.count("frames_dropped", len(frames))
             names = ", ".join(repr(frame.name) for frame in frames[:3])
             more = f" and {len(frames) - 3} more" if len(frames) > 3 else ""
+            whose = "" if len({frame.reason for frame in frames}) == 1 else "the first, as "
             self.warn(
                 f"{source.name}: {len(frames)} of {total} frames dropped, {names}{more}: "
-                f"{frames[0].reason}. [{rule}]"
+                f"{whose}{frames[0].reason}. [{rule}]"
             )
 
     def _by_rule(self) -> dict[str, list[DroppedFrame]]:
@@ -205,10 +208,10 @@ def refuse_photographs(
     """True where all images are low dynamic range, False where none is; InputRefused otherwise.
 
     Photographs hold display values, not radiance: they are used only if the user says so. So do
-    TIFF files of whole numbers, unless their ``encoding`` is stated to be another.
+    TIFF of whole numbers and PNG of 16 bits, unless their ``encoding`` is stated to be another.
     """
     said = encoding is not None and kind_of_encoding(encoding) != "display"
-    photographs = [p for p in paths if _is_photograph(p) or (not said and _is_whole_tiff(p))]
+    photographs = [p for p in paths if _is_photograph(p) and not (said and _may_be_radiance(p))]
     if not photographs:
         return False
     if len(photographs) < len(paths):
@@ -219,49 +222,73 @@ def refuse_photographs(
         )
     if not assume_srgb:
         kind = photographs[0].suffix[1:].upper()
+        unless = " as whole numbers, unless --input-space says that they are linear or logarithms"
         raise InputRefused(
-            f"{photographs[0]}: {len(photographs)} frames are {kind}, which does not hold "
-            f"radiance{_TIFF if _is_whole_tiff(photographs[0]) else ''}. Export scene-linear EXR, "
-            "or accept a result that is not radiometric with --assume-srgb. [capture.ldr]"
+            f"{photographs[0]}: {len(photographs)} frames are {kind}, which does not hold radiance"
+            f"{unless * _may_be_radiance(photographs[0])}. Export scene-linear EXR, or "
+            "accept a result that is not radiometric with --assume-srgb. [capture.ldr]"
         )
     return True
 
 
-_TIFF = " as whole numbers, unless --input-space says that they are linear or logarithms"
-
-
 def _is_photograph(path: Path) -> bool:
-    return path.suffix.lower() in PHOTOGRAPH_SUFFIXES
-
-
-def _is_whole_tiff(path: Path) -> bool:
+    """By its name or, as telephones call JPEGs .HEIC and people anything .exr, by what it is."""
     with suppress(ImageRefused):  # of which the reader of its pixels will tell
-        return path.suffix.lower() in (".tif", ".tiff") and holds_whole_numbers(path)
+        named = path.suffix.lower() in PHOTOGRAPH_SUFFIXES
+        return named or is_jpeg_or_png(path) or _may_be_radiance(path)
+    return False
+
+
+def _may_be_radiance(path: Path) -> bool:
+    """Whether it is TIFF of whole numbers or PNG of 16 bits, which raw developers write linear."""
+    with suppress(ImageRefused):
+        if path.suffix.lower() in (".tif", ".tiff"):
+            return holds_whole_numbers(path)
+        return path.suffix.lower() == ".png" and not is_eight_bit(path)
     return False
 
 
 def tagged_encoding(
     records: Sequence[FrameRecord], usual: str, findings: Findings, source: Path
 ) -> str:
-    """The colour space that the first image says it has, of which the user is told; ``usual`` where
-    it says none of the same kind."""
-    name, tag = "", None
-    with suppress(ImageRefused):  # of which the reader of its pixels will tell
-        name, places = colour_tag(records[0].image_path) if records else ("", ())
-        tag = encoding_of_tag(name, places)
-    if name and tag is None and kind_of_encoding(usual) == "display":
+    """The colour space that the images say they have, of which the user is told; ``usual`` where
+    they say none of the same kind. InputRefused where they say several."""
+    display = kind_of_encoding(usual) == "display"
+    first_of: dict[str, Path] = {}
+    unknown: dict[str, str] = {}
+    for record in records:
+        with suppress(ImageRefused):  # of which the reader of its pixels will tell
+            name, places = colour_tag(record.image_path)
+            tag = encoding_of_tag(name, places)
+            if tag is None and (name and display):
+                unknown.setdefault(record.image_path.name, f"colour space is {name!r}")
+            elif tag is None and places:
+                said = ", ".join(f"{place:.4g}" for place in places)
+                unknown.setdefault(record.image_path.name, f"primaries and white are {said}")
+            elif tag is not None and display and kind_of_encoding(tag) == "linear":
+                unknown.setdefault(record.image_path.name, f"values are linear ({tag})")
+            alike = tag is not None and (kind_of_encoding(tag) == "display") == display
+            first_of.setdefault(tag if tag and alike else usual, record.image_path)
+    if len(first_of) > 1:
+        (one, first), (other, second), *_ = first_of.items()
+        raise InputRefused(
+            f"{source}: the images have several colour spaces: {first.name!r} is {one}, "
+            f"{second.name!r} {other}. Convert them to one, or state --input-space to have all "
+            "read as one. [capture.encoding]"
+        )
+    if unknown:
+        image, said = next(iter(unknown.items()))
         findings.warn(
-            f"{source.name}: the images say that their colour space is {name!r}, which is not "
-            f"known; they are read as {usual}. Convert them to sRGB, or state --input-space. "
+            f"{source.name}: {len(unknown)} images say that their {said}, first {image!r}, which "
+            f"is not read here: they pass for {usual}. Convert them, or state --input-space. "
             "[capture.encoding]"
         )
-    kinds = [kind_of_encoding(encoding) == "display" for encoding in (tag or usual, usual)]
-    if tag is None or tag == usual or kinds[0] != kinds[1]:
-        return usual
-    findings.warn(
-        f"{source.name}: the images say that their colour space is {tag}, and are read so. State "
-        "--input-space if they are not. [capture.encoding]"
-    )
+    tag = next(iter(first_of), usual)
+    if tag != usual:
+        findings.warn(
+            f"{source.name}: the images say that their colour space is {tag}, and are read so. "
+            "State --input-space if they are not. [capture.encoding]"
+        )
     return tag
 
 

@@ -1,16 +1,18 @@
-"""In which of two frames a mesh lies: where the points lie on it that its photographs share."""
+"""In which frame a mesh lies: where the points lie on it that its photographs share."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.model.arrays import Double, Int
+from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.untrusted.colmap_models import colmap_points
-from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
+from usdbrdf.untrusted.mesh_files import mesh_from_file
 
 # Places on the mesh, faces that are looked at at a time, or whose corners are compared, and points
 # that are; fewer of these say nothing.
@@ -18,25 +20,56 @@ _PLACES, _MOST_FACES, _MOST_POINTS, _FEWEST_POINTS = 100_000, 500_000, 20_000, 3
 # Half of the points lie nearer to their mesh than this, in parts of their spread, and farther from
 # one of another frame by this factor.
 _ON_IT, _CLEARLY = 0.1, 3.0
+# Of a mesh that its cameras see as it is. Beyond it lies elsewhere, or is but a part of the scene.
+_FITS = 0.05
 
 
-def lies_with_points(mesh: Path, model: Path, moved: Double) -> bool | None:
-    """Whether a mesh lies where the points of a COLMAP model lie (True), or where ``moved``, a
-    similarity (4, 4), takes them (False); None where they do not tell, or cannot be read."""
+class Lies(NamedTuple):
+    """Where a mesh lies: on the points of a COLMAP model (True), or where these are moved to
+    (False), None where they do not tell; and whether it is known to lie on neither."""
+
+    with_points: bool | None
+    elsewhere: bool
+
+
+def lies_with_points(mesh: Path, model: Path, moved: Double) -> Lies:
+    """Which it is of a mesh, ``moved`` being a similarity (4, 4)."""
+    points = _points(model)
+    if points is None:
+        return Lies(None, elsewhere=False)
+    found = mesh_from_file(mesh)
+    surface = cKDTree(_places_on(found.points, found.triangles))
+    here = _off(surface, points)
+    there = _off(surface, points @ moved[:3, :3].T + moved[:3, 3])
+    if min(here, there) > _ON_IT or max(here, there) < _CLEARLY * min(here, there):
+        return Lies(None, elsewhere=min(here, there) > _ON_IT)
+    return Lies(here < there, elsewhere=False)
+
+
+def why_elsewhere(mesh: ScanMesh, model: Path) -> str:
+    """A sentence where the points of a COLMAP model do not lie on the mesh of its capture; "" where
+    they do, are too few, or cannot be read."""
+    points = _points(model)
+    if points is None:
+        return ""
+    off = _off(cKDTree(_places_on(mesh.points, mesh.triangles)), points)
+    if off < _FITS:
+        return ""
+    return (
+        f"half of the points of COLMAP's model lie farther off this mesh than {off:.2g} of their "
+        "spread, so it is but a part of what the photographs show, or lies in another frame or "
+        "unit than the cameras. Make one of this model if it does"
+    )
+
+
+def _points(model: Path) -> Double | None:
+    """(N, 3) of a model, spread evenly if they are many; None where they say nothing."""
     try:
         points = colmap_points(model)
     except InputRefused:  # they help, but no capture needs them
         return None
     points = points[np.isfinite(points).all(axis=1)]
-    if len(points) < _FEWEST_POINTS:
-        return None
-    points = points[:: -(-len(points) // _MOST_POINTS)]
-    surface = cKDTree(_places_on(mesh_from_file(mesh)))
-    here = _off(surface, points)
-    there = _off(surface, points @ moved[:3, :3].T + moved[:3, 3])
-    if min(here, there) > _ON_IT or max(here, there) < _CLEARLY * min(here, there):
-        return None
-    return here < there
+    return points[:: -(-len(points) // _MOST_POINTS)] if len(points) >= _FEWEST_POINTS else None
 
 
 def _off(surface: cKDTree, points: Double) -> float:
@@ -46,23 +79,23 @@ def _off(surface: cKDTree, points: Double) -> float:
     return float(np.median(distance) / max(float(spread), np.finfo(np.float64).tiny))
 
 
-def _places_on(mesh: FileMesh) -> Double:
+def _places_on(points: Float, triangles: Int) -> Double:
     """Places evenly over all faces, large ones have few corners; and corners, which lie close where
     there is detail."""
-    parts = np.array_split(mesh.triangles, -(-len(mesh.triangles) // _MOST_FACES))
-    area = np.concatenate([_areas(mesh, some) for some in parts])
+    parts = np.array_split(triangles, -(-len(triangles) // _MOST_FACES))
+    area = np.concatenate([_areas(points, some) for some in parts])
     before = np.concatenate([[0.0], np.cumsum(area)])
     chance = np.random.default_rng(0)
     where = chance.uniform(0, before[-1], _PLACES)
     face = np.clip(np.searchsorted(before, where, side="right") - 1, 0, len(area) - 1)
-    a, b, c = np.moveaxis(mesh.points[mesh.triangles[face]].astype(np.float64), 1, 0)
+    a, b, c = np.moveaxis(points[triangles[face]].astype(np.float64), 1, 0)
     u, v = chance.uniform(size=(2, _PLACES, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    some = np.unique(mesh.triangles[:: len(parts)])
-    return np.concatenate([a + u * (b - a) + v * (c - a), mesh.points[some].astype(np.float64)])
+    some = np.unique(triangles[:: len(parts)])
+    return np.concatenate([a + u * (b - a) + v * (c - a), points[some].astype(np.float64)])
 
 
-def _areas(mesh: FileMesh, triangles: Int) -> Double:
+def _areas(points: Float, triangles: Int) -> Double:
     """(T,) twice those of some faces."""
-    a, b, c = np.moveaxis(mesh.points[triangles].astype(np.float64), 1, 0)
+    a, b, c = np.moveaxis(points[triangles].astype(np.float64), 1, 0)
     return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1), np.float64)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import wraps
 from inspect import signature
@@ -30,11 +29,12 @@ from usdbrdf.capture.checks import (
 )
 from usdbrdf.capture.develop import frames_of_photographs
 from usdbrdf.capture.rigid_poses import rigid_records
-from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing, UsageError, UsdBrdfError
+from usdbrdf.errors import InputRefused, MeshMissing, UsageError, UsdBrdfError
 from usdbrdf.files.colour import kind_of_encoding, known_encodings, unknown_encoding
 from usdbrdf.files.documents import read_json
+from usdbrdf.files.exif import exif_exposures
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
-from usdbrdf.files.images import MAX_SIDE, exif_exposure
+from usdbrdf.files.images import MAX_SIDE
 from usdbrdf.files.naming import unique_identifiers
 from usdbrdf.geometry.mesh_clean import clean_mesh
 from usdbrdf.geometry.normals import corner_normals
@@ -452,15 +452,19 @@ def as_photographs(
     else that of all images' EXIF data."""
     told = ""
     if all(record.exposure_time == 1 for record in records):
-        given = [_exposure_of_file(record.image_path) for record in records]
-        known = [exposure for exposure in given if exposure is not None]
-        if known and len(known) == len(records):
+        known, any_told = exif_exposures([record.image_path for record in records])
+        if known:
             records = [
                 replace(record, exposure_time=exposure)
                 for record, exposure in zip(records, known, strict=True)
             ]
             stops = math.log2(max(known) / min(known))
             told = f" The exposures of their EXIF data are divided out ({stops:.1f} stops)."
+        elif any_told:
+            told = (
+                " Their EXIF data are not compared, as not all tell exposure time, f-number and "
+                "ISO speed alike: they pass for equally exposed."
+            )
     findings.warn(
         f"{source.name}: the images are 8-bit sRGB photographs, so the result is not radiometric: "
         f"colours and relative brightness only.{told} [capture.ldr]"
@@ -470,12 +474,6 @@ def as_photographs(
         replace(r, saturation_radiance=float(high), noise_floor_radiance=float(low))
         for r, high, low in zip(records, saturation, noise_floor, strict=True)
     ]
-
-
-def _exposure_of_file(path: Path) -> float | None:
-    with suppress(ImageRefused):  # of which the reader of its pixels will tell
-        return exif_exposure(path)
-    return None
 
 
 def radiance_encoding(

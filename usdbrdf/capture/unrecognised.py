@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +17,31 @@ _OF_COLMAP = frozenset(
 # Whose bytes say nothing of a program; and which may hold cameras, that are not read.
 _NO_DOCUMENTS = _PICTURES | _MESHES | _STAGES
 _SCENES = frozenset((".fbx", ".glb", ".gltf"))
+# What is no capture yet, whatever else it holds: by suffixes, what it is and what to do.
+_NOT_YET = (
+    (
+        (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst"),
+        "is an archive. Unpack it, and name the folder of what it held",
+    ),
+    (
+        (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".insv", ".360"),
+        "is a video, which does not say where its camera stood. Extract frames, have their poses "
+        "found (COLMAP), and name the folder that holds both",
+    ),
+    (
+        (
+            ".heic", ".heif", ".hif", ".webp", ".avif", ".jxl", ".bmp",
+            ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf",
+        ),
+        "is a picture of a kind that is not read here, and nothing says where its camera stood. "
+        "Have the poses of all found (COLMAP, Metashape), and name the folder that holds both",
+    ),
+    (
+        (".las", ".laz", ".pts", ".ptx", ".pcd", ".rcp", ".rcs", ".splat", ".ksplat", ".spz"),
+        "holds points or splats alone. Make a mesh of the scan, and bring the photographs with "
+        "the document of their cameras",
+    ),
+)  # fmt: skip
 _MOST_FILES, _HEAD = 10_000, 4096  # looked at in a folder; bytes of a document
 
 
@@ -260,6 +285,8 @@ def what_lies_there(path: Path) -> str:
     if meshes:
         first = f"the mesh {meshes[0].name}" if len(meshes) == 1 else f"{len(meshes)} meshes"
         held = f"{held} and {first}" if held else first
+    if not held and (said := _not_yet(files)):
+        return said
     if not held:
         return "it holds neither pictures nor cameras. Name the folder that holds the capture"
     how = (
@@ -270,6 +297,15 @@ def what_lies_there(path: Path) -> str:
         else "Have them found (COLMAP, Metashape, RealityScan), and name the folder that holds both"
     )
     return f"it holds {held}, but nothing known here says where the cameras stood. {how}"
+
+
+def _not_yet(files: Sequence[Path]) -> str:
+    """What the first of these files is that may become a capture, and how; "" where none is."""
+    for suffixes, what in _NOT_YET:
+        for file in files:
+            if file.suffix.lower() in suffixes:
+                return f"{file.name} {what}"
+    return ""
 
 
 def _files(path: Path) -> Iterator[Path]:

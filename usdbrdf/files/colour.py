@@ -35,9 +35,10 @@ _NAMES = {
     "lin_rec709_scene": ("lin_rec709_scene", "lin_rec709_srgb", "lin_rec709"),
     "srgb_rec709_scene": ("srgb_rec709_scene", "srgb_tx"),
 }
-# x, y of red, green, blue and white (SMPTE ST 2065-1, Academy S-2014-004, ITU-R BT.709 and BT.2020,
-# SMPTE EG 432-1), and by how much numbers in files are off.
+# x, y of red, green, blue and white (Adobe RGB (1998), SMPTE ST 2065-1, Academy S-2014-004, ITU-R
+# BT.709 and BT.2020, SMPTE EG 432-1), and by how much numbers in files are off.
 _CHROMATICITIES = {
+    "lin_adobergb_scene": (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.329),
     "lin_ap0_scene": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
     "lin_ap1_scene": (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767),
     "lin_p3d65_scene": (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329),
@@ -48,11 +49,15 @@ _SAME_PLACE = 2e-3
 # What ICC profiles of photographs call themselves, in lower case; the short ones are those that
 # services put into pictures to save bytes.
 _PROFILES = {
+    "adobe rgb (1998)": "g22_adobergb_scene",
+    "adobergb1998": "g22_adobergb_scene",
+    "compatible with adobe rgb (1998)": "g22_adobergb_scene",
     "c2": "srgb_rec709_scene",
     "c2ci": "srgb_rec709_scene",
     "display p3": "srgb_p3d65_scene",
     "sp3c": "srgb_p3d65_scene",
 }
+_LINEAR_OF = {"srgb_p3d65_scene": "lin_p3d65_scene", "g22_adobergb_scene": "lin_adobergb_scene"}
 # Those of Android, GIMP, Ghostscript and others; not of linear values with the same primaries, nor
 # of other primaries whose values have sRGB's curve.
 _CALLED_SRGB = re.compile(
@@ -87,14 +92,15 @@ def encoding_of_tag(name: str, chromaticities: tuple[float, ...]) -> str | None:
     """The colour space that an image says it has, see ``files.images.colour_tag``; None where it
     says nothing that is known."""
     profile = name.lower().strip()
-    if profile in _PROFILES:
+    if kind_of_encoding(_PROFILES.get(profile, "")):
         return _PROFILES[profile]
     if name and kind_of_encoding(name):
         return name
     if _CALLED_SRGB.match(profile):
         return DISPLAY_SPACE
     for encoding, places in _CHROMATICITIES.items():
-        if chromaticities and np.abs(np.subtract(places, chromaticities)).max() < _SAME_PLACE:
+        close = chromaticities and np.abs(np.subtract(places, chromaticities)).max() < _SAME_PLACE
+        if close and kind_of_encoding(encoding):
             return encoding
     return None
 
@@ -112,11 +118,11 @@ def unknown_encoding(encoding: str) -> str:
 
 def linear_space_of(encoding: str) -> str:
     """The scene-linear space in which values of ``encoding`` are judged, and clip: their own if
-    they are linear, and of Display P3, whose colours beyond Rec.709 are negative there; else the
-    working space."""
+    they are linear, and of Display P3 and Adobe RGB, whose colours beyond Rec.709 are negative
+    there; else the working space."""
     if kind_of_encoding(encoding) == "linear":
         return encoding
-    return "lin_p3d65_scene" if encoding == "srgb_p3d65_scene" else WORKING_SPACE
+    return _LINEAR_OF.get(encoding, WORKING_SPACE)
 
 
 def to_linear(pixels: Float, encoding: str) -> Float:

@@ -20,6 +20,7 @@ from usdbrdf.files.colour import (
     to_working_space,
 )
 from usdbrdf.files.images import read_radiance, resized
+from usdbrdf.files.radiance_header import factors_of_hdr
 from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.capture import Frames
 
@@ -163,6 +164,7 @@ def read_recorded(path: Path, encoding: str, saturation: float, gain: float = 1.
     ringing and become 0.
     """
     stored = read_radiance(path, alpha=True)
+    stored[..., :3] /= factors_of_hdr(path).astype(np.float32)
     recorded, transparent = np.ascontiguousarray(stored[..., :3]), transparent_of(stored)
     kind = kind_of_encoding(encoding)
     if kind == "log":

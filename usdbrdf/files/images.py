@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +22,7 @@ from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
 from usdbrdf.files.channels import colours_of, layers_with_colours
 from usdbrdf.files.paths import readable_size
+from usdbrdf.files.radiance_header import primaries_of_hdr
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Bool, Byte, Float
 
@@ -46,10 +47,6 @@ RAW_SUFFIXES = frozenset((
 ))
 # fmt: on
 _CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
-
-# Stops between a stated time and a stated shutter's speed: below the first both are exact, as of
-# telephones; beyond the second, which the names on dials do not reach, one of them is wrong.
-_EXACT_STOPS, _ROUNDED_STOPS = 0.005, 0.15
 
 _FOR_A_HEADER = 16 << 20  # bytes
 # As OpenImageIO and the libraries below it put it.
@@ -83,7 +80,9 @@ def _radiance(path: Path, max_side: int, alpha: bool) -> Float:
                 f"{len(colours)} {have} R, G and B ({names}), and not one of them alone is "
                 "called beauty or Combined"
             )
-        raise ImageRefused(f"{path}: {said}. Export the beauty pass as R, G, B. [image.channels]")
+        grey = set(source.spec().channelnames) <= {"Y", "A"}
+        cure = "It is grey: export it in colour" if grey else "Export the beauty pass as R, G, B"
+        raise ImageRefused(f"{path}: {said}. {cure}. [image.channels]")
     channels = [colours[letter] for letter in ("rgba" if alpha else "rgb") if letter in colours]
     pixels = pixels_of(path, source)
     if channels != list(range(pixels.shape[2])):
@@ -152,7 +151,11 @@ def kind_of_colours(path: Path) -> int:
 def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
     """What an image's header says of its colour space: that of the ICC profile in it, else another
     name, "" without one; and x, y of red, green, blue and white, () without these."""
-    spec = open_image(path).spec()
+    source = open_image(path)
+    spec = source.spec()
+    # Of Radiance's files OpenImageIO says Rec.709, whatever primaries they state.
+    if source.format_name() == "hdr" and (stated := primaries_of_hdr(path)):
+        return "", stated
     # Of JPEG and PNG OpenImageIO says sRGB, whatever profile is in them.
     name = spec.getattribute("ICCProfile:profile_description")
     name, places = name or spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")
@@ -160,10 +163,21 @@ def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
     return str(name or ""), tuple(float(place) for place in places) if sound else ()
 
 
+def header_of(path: Path, names: Sequence[str]) -> list[Any]:
+    """What an image's header says by these names, None where it says nothing."""
+    spec = open_image(path).spec()
+    return [spec.getattribute(name) for name in names]
+
+
 def stored_space(path: Path) -> tuple[str, int]:
     """The colour space that an image's header names, "" for none, and how many channels it has."""
     spec = open_image(path).spec()
     return str(spec.getattribute("oiio:ColorSpace") or ""), int(spec.nchannels)
+
+
+def is_jpeg_or_png(path: Path) -> bool:
+    """Whether the image is one of these, whatever its name says, from the header alone."""
+    return open_image(path).format_name() in ("jpeg", "png")
 
 
 def is_eight_bit(path: Path) -> bool:
@@ -174,35 +188,6 @@ def is_eight_bit(path: Path) -> bool:
 def holds_whole_numbers(path: Path) -> bool:
     """Whether the image holds bytes or larger whole numbers, from the header alone."""
     return "int" in str(open_image(path).spec().format)
-
-
-def exif_exposure(path: Path) -> float | None:
-    """How much light a photograph was given, from its EXIF data: exposure time in seconds times
-    ISO / 100, over the square of the f-number; what is not told counts as ISO 100 and f/1. None
-    without an exposure time.
-
-    A dial's 1/30 or 1/125 is a name: the shutter opens for 1/32 and 1/128. Where the shutter's
-    speed in stops says so, that is taken, as a whole, half or third stop."""
-    spec = open_image(path).spec()
-    time = spec.getattribute("ExposureTime")
-    number, speed = spec.getattribute("FNumber"), spec.getattribute("Exif:PhotographicSensitivity")
-    given = [v if isinstance(v, int | float) and v > 0 else None for v in (time, number, speed)]
-    if given[0] is None:
-        return None
-    time = _shutter_time(float(given[0]), spec.getattribute("Exif:ShutterSpeedValue"))
-    return float(time * (given[2] or 100) / 100 / (given[1] or 1) ** 2)
-
-
-def _shutter_time(time: float, stops: object) -> float:
-    """For how long a shutter was open whose exposure time is stated, and perhaps its speed: the
-    latter, set to the nearest stop of a dial, where they differ by no more than names do."""
-    if not isinstance(stops, int | float) or not math.isfinite(time):
-        return time
-    if not _EXACT_STOPS < abs(stops + math.log2(time)) < _ROUNDED_STOPS:
-        return time
-    return float(
-        2 ** -min(round(3 * stops) / 3, round(2 * stops) / 2, key=lambda v: abs(v - stops))
-    )
 
 
 def write_exr(

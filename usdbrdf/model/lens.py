@@ -3,6 +3,7 @@ write. A pinhole is a lens that bends nothing; cameras after ingest are pinholes
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, get_args
@@ -53,6 +54,7 @@ class Lens:
     prism       s1, s2, s3, s4
     skew        b: Metashape's B2 / fx
     radial_first   tangential and prism terms are taken of (x R, y R) instead of (x, y)
+    circle      r R beyond which nothing is imaged, as of the picture's circle in a fisheye's
     """
 
     curve: Curve = "perspective"
@@ -64,6 +66,7 @@ class Lens:
     prism: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     skew: float = 0.0
     radial_first: bool = False
+    circle: float = math.inf
 
     def __post_init__(self) -> None:
         numbers = (*self.shape, *self._bending)
@@ -72,6 +75,7 @@ class Lens:
             or len(self.shape) != len(_SHAPE.get(self.curve, ()))
             or max(len(self.radial), len(self.odd), len(self.divisor)) > _MOST_RADIAL
             or not np.isfinite(numbers).all()
+            or not self.circle > 0
         ):
             raise InputRefused(f"{self}: this is no lens. Correct its numbers. [camera.lens]")
 
@@ -87,6 +91,7 @@ class Lens:
             *((f"p{i + 1}", p) for i, p in enumerate(self.tangential)),
             *((f"s{i + 1}", s) for i, s in enumerate(self.prism)),
             ("b", self.skew),
+            ("circle", self.circle if math.isfinite(self.circle) else 0.0),
         ]
         words = [f"{name} {float(number)!r}" for name, number in numbered if number]
         return " ".join([self.curve, *words, *(["radial first"] if self.radial_first else [])])
@@ -124,7 +129,7 @@ class Lens:
 
     @property
     def widest_angle(self) -> float:
-        """Radians off the axis up to which a larger angle means a larger radius."""
+        """Radians off the axis up to which a larger angle means a larger radius, in the circle."""
         return _widest_angle(self)
 
     @property
@@ -207,8 +212,9 @@ def _widest_angle(lens: Lens) -> float:
     angles = np.linspace(0, np.pi, _ANGLES)
     # NaN is no step outwards either.
     with np.errstate(invalid="ignore"):
-        inwards = np.flatnonzero(~(np.diff(lens.distance(angles)) > 0))
-    return float(angles[inwards[0] if len(inwards) else -1])
+        distance = lens.distance(angles)
+        ended = np.flatnonzero(~(np.diff(distance) > 0) | (distance[1:] > lens.circle))
+    return float(angles[ended[0] if len(ended) else -1])
 
 
 def is_fisheye_of_turn(matrix: Double, terms: tuple[float, ...]) -> bool:

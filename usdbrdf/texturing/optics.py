@@ -23,6 +23,7 @@ from usdbrdf.texturing.exposures import surfaces_agree
 from usdbrdf.transport.rays import RayScene
 
 _OUTLYING = calibration.number("optics.outlying")
+_MOST = calibration.number("optics.most")
 _TOLD = calibration.number("optics.told")
 _STANDING_OUT = calibration.number("optics.standing_out")
 # Steps of the reweighting, and of taking means off rows and columns in turn.
@@ -48,8 +49,9 @@ class Falloff(NamedTuple):
 
     @property
     def is_clear(self) -> bool:
-        """Whether the frames darken, or brighten, so much that it is worth telling."""
-        return abs(self.stops) > max(_TOLD, _STANDING_OUT * self.error)
+        """Whether the frames darken, or brighten, so much that it is worth telling, and not more
+        than lenses do."""
+        return max(_TOLD, _STANDING_OUT * self.error) < abs(self.stops) < _MOST
 
 
 def samples_in_frame(

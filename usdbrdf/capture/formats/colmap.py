@@ -3,7 +3,8 @@
 ::
 
     CAPTURE/
-      sparse/0/ or sparse/ or the folder itself     cameras and images, distorted or not
+      sparse/0/ or sparse/ or the folder itself     cameras and images, distorted or not; else any
+                                                    folder that holds a model and nothing else
       images/, input/, images_2/ ...                as the model names them, in subfolders too;
                                                     else the only other folder that holds them,
                                                     none of normals, depths or masks
@@ -35,6 +36,7 @@ from usdbrdf.capture.formats.named_pictures import (
     path_in_capture,
     scan_of,
 )
+from usdbrdf.capture.mesh_frames import why_elsewhere
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -43,6 +45,7 @@ from usdbrdf.files.images import image_size
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
+from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import ColmapCamera, ColmapModel, colmap_model, model_files
 
@@ -55,8 +58,10 @@ _MODELS = ("", "sparse/0", "sparse", "colmap_sparse/0", "colmap_text")
 _IMAGES = ("images", "input", "", "images_2", "images_4", "images_8")
 # What scaled-down copies of images are in.
 _REDUCED = re.compile(r"(^|/)images_\d+$")
-# How deep in the capture other folders of images are looked for.
-_BELOW = ("*/", "*/*/")
+# How deep in the capture other folders of images are looked for, and of models; what lies beside
+# these.
+_BELOW, _MODELS_BELOW = ("*/", "*/*/"), ("*/", "*/*/", "*/*/*/")
+_BESIDE_MODELS = frozenset((".bin", ".txt", ".db", ".ini", ".ply", ".json", ".yaml", ".log"))
 # Words in the names of folders whose pictures are no photographs, although they are called as these
 # are.
 _LAYERS = re.compile(
@@ -91,15 +96,18 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             f"{up_axis}. State them with --meters-per-unit and --up-axis. [colmap.scale]"
         )
     objects = path_in_capture(path, "objects.json", options)
+
+    def geometry() -> ScanGeometry:
+        mesh = options.mesh or _mesh(path, options)
+        labels = options.objects or (objects if objects.is_file() else None)
+        found = geometry_from_file(mesh, labels, options, findings, capture_root=path)
+        if why := why_elsewhere(found.mesh, chosen.folder):
+            findings.warn(f"{mesh.name}: {why}. [mesh.frame]")
+        return found
+
     return scan_of(
         records,
-        lambda: geometry_from_file(
-            options.mesh or _mesh(path, options),
-            options.objects or (objects if objects.is_file() else None),
-            options,
-            findings,
-            capture_root=path,
-        ),
+        geometry,
         options,
         findings,
         adapter=NAME,
@@ -180,7 +188,16 @@ def _workspaces(path: Path) -> list[_Workspace]:
         elif not workspace and (path / "distorted/sparse").is_dir():
             beside.remove("input")  # what its images were made of
         found += [_Workspace(f, tuple(beside)) for f in folders if model_files(f)]
-    return found
+    # Of any name, if nothing but the model lies there: others may be captures of their own.
+    others = (f for pattern in _MODELS_BELOW for f in sorted(path.glob(pattern)) if not found)
+    return found or [_Workspace(f, _IMAGES) for f in others if _holds_a_model_alone(f)]
+
+
+def _holds_a_model_alone(folder: Path) -> bool:
+    """Whether there are neither folders nor pictures or meshes beside a model."""
+    if folder.name.startswith(".") or not model_files(folder):
+        return False
+    return all(f.is_file() and f.suffix.lower() in _BESIDE_MODELS for f in folder.iterdir())
 
 
 def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
@@ -215,10 +232,10 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
                 "with 'colmap mapper', and name the folder that holds what it writes. "
                 "[colmap.model]"
             )
-        raise InputRefused(
-            f"{where}. Put the model in sparse/0 and the images in images/, or name their folder "
-            "with --frames. [colmap.images]"
-        )
+        cure = "Put the model in sparse/0 and the images in images/"
+        above = _images_above(path, first)
+        cure = f"Name {above}, where they are" if above else f"{cure}, or name theirs by --frames"
+        raise InputRefused(f"{where}. {cure}. [colmap.images]")
     fitting = [c for c in candidates if _images_fit(pictured, c, candidates)]
     chosen = (fitting or candidates)[0]
     parts = [c for c in candidates if c.images == chosen.images]
@@ -230,6 +247,12 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
             f"{len(largest.model.names)}. [colmap.model]"
         )
     return largest
+
+
+def _images_above(path: Path, image: str) -> Path | None:
+    """The folder above a model's that holds its images in a usual place."""
+    above = path.parents[:2] if image else ()
+    return next((p for p in above if any((p / f / image).is_file() for f in _IMAGES)), None)
 
 
 def _of_full_size(counts: dict[str, int]) -> dict[str, int]:

@@ -154,6 +154,11 @@ def frame_records(
             why = "its sensor is not calibrated" if sensor is None else "it has not been aligned"
             findings.drop(label, why, "capture.alignment")
             continue
+        place = place_of(camera)
+        if place is None:
+            said = f"its component {camera.get('component_id')!r} stands nowhere among the others"
+            findings.drop(label, said, "capture.alignment")
+            continue
         image = picture_of.get(camera)
         if image is None and shared[label] > 1:
             said = f"{shared[label]} cameras have this label, and no picture or several this name"
@@ -168,7 +173,7 @@ def frame_records(
             )
             findings.drop(label, said, "capture.label")
             continue
-        pose = place_of(camera).pose(master.reshape(4, 4) @ sensor.master_from_sensor)
+        pose = place.pose(master.reshape(4, 4) @ sensor.master_from_sensor)
         records.append(
             FrameRecord(
                 name=label,
@@ -209,8 +214,9 @@ def _is_enabled(camera: Element) -> bool:
     return camera.get("enabled", "true").lower() not in ("false", "0")
 
 
-def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Element], _Place]:
-    """Where what is in a camera's chunk stands: as the chunk says, else the camera's component."""
+def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Element], _Place | None]:
+    """Where a camera's component stands, as it says itself, else the chunk; None of one that was
+    not aligned with the others. Where none is placed the largest has its own coordinates."""
     own = _place(chunk.find("transform"))
     parts = chunk.iterfind("components/component")
     components = {part.get("id", ""): _place(part.find("transform")) for part in parts}
@@ -227,7 +233,22 @@ def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Eleme
             f"{source.name}: the chunk has no transform, so its unit is arbitrary. State "
             "--meters-per-unit. [capture.unit]"
         )
-    return lambda camera: own or components.get(camera.get("component_id", "")) or _UNPLACED
+    held = Counter(
+        camera.get("component_id", "")
+        for camera in chunk.iterfind("cameras//camera")
+        if camera.find("transform") is not None and _is_enabled(camera)
+    )
+    largest = max(held, key=held.__getitem__, default="")
+    is_placed = own is not None or any(components.values())
+
+    def place_of(camera: Element) -> _Place | None:
+        component = camera.get("component_id", "")
+        if place := components.get(component) or own:
+            return place
+        alone = not is_placed and component in (largest, "")
+        return _UNPLACED if alone or component not in components else None
+
+    return place_of
 
 
 def _distance(place: _Place) -> float:

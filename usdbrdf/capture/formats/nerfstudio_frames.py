@@ -14,15 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.formats.colmap import world_from_camera
 from usdbrdf.capture.formats.named_pictures import rigid_pose
-from usdbrdf.capture.mesh_frames import lies_with_points
+from usdbrdf.capture.mesh_frames import Lies, lies_with_points
 from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.documents import read_json
@@ -49,9 +50,6 @@ _LARGEST = 1e9  # number that makes sense in a matrix
 # By which instant-ngp's meshes are known, PLY and OBJ; what it takes where a document says nothing.
 _OF_NGP = (b"output from https://github.com/NVlabs/instant-ngp", b"mtllib nerf.mtl")
 _NGP_SCALE, _NGP_OFFSET = 0.33, 0.5
-# Lenses that it has by a key: the longitudes and latitudes of a whole sphere, their equal-area
-# cylinder, none, and a polynomial of the pixels' distance.
-_NGP_LENSES = ("latlong", "equirectangular", "orthographic", "ftheta_p0")
 _NGP_AXES = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
@@ -94,13 +92,6 @@ def rolling_shutter(holder: Mapping[str, Any]) -> list[Any]:
     """What instant-ngp's rolling_shutter says, times of which each is 0 where there is none."""
     stated = holder.get("rolling_shutter")
     return stated if isinstance(stated, list) else [stated]
-
-
-def lens_key(said: Mapping[str, Any]) -> str:
-    """The camera_model that is meant by one of instant-ngp's keys for its lenses (read_lens); the
-    key itself where no model that is known is; "" where there is none. 0 is a coefficient too."""
-    key = next((k for k in _NGP_LENSES if said.get(k) is not None and said[k] is not False), "")
-    return "EQUIRECTANGULAR" if key == "latlong" else key
 
 
 def camera_axes(document: Mapping[str, Any]) -> Double:
@@ -244,7 +235,11 @@ def _home_of_colmaps(
     name = model.relative_to(folder).as_posix()
     if np.array_equal(moved, np.eye(4)):
         stored = applied.similarity
-        if np.array_equal(stored, np.eye(4)) or lies_with_points(mesh, model, stored) is not False:
+        if np.array_equal(stored, np.eye(4)):
+            return None
+        lies = lies_with_points(mesh, model, stored)
+        if lies.with_points is not False:
+            _warn_of_elsewhere(mesh, name, lies, findings)
             return None
         findings.warn(
             f"{mesh.name}: lies in the frame of the document's poses, by the points of the model "
@@ -252,22 +247,32 @@ def _home_of_colmaps(
         )
         return np.asarray(np.linalg.inv(stored), np.float64)
     lies = lies_with_points(mesh, model, moved)
-    if lies is False:
+    if lies.with_points is False:
         if of_colmap:
             findings.warn(
                 f"{mesh.name}: is called as COLMAP's meshes, but lies in the frame of the poses "
                 f"already, by the points of the model {name}; it stays there. [mesh.frame]"
             )
         return np.eye(4)
-    if lies is None and not of_colmap:
+    if lies.with_points is None and not of_colmap:
+        _warn_of_elsewhere(mesh, name, lies, findings)
         return None
-    how = "lies" if lies else "is called as COLMAP's meshes, which lie"
-    doubt = "" if lies else " Rename it if it lies there already."
+    how = "lies" if lies.with_points else "is called as COLMAP's meshes, which lie"
+    doubt = "" if lies.with_points else " Rename it if it lies there already."
     findings.warn(
         f"{mesh.name}: {how} in the frame of COLMAP's model {name}; it is brought to that of the "
         f"poses, by the cameras of both.{doubt} [mesh.frame]"
     )
     return moved
+
+
+def _warn_of_elsewhere(mesh: Path, model: str, lies: Lies, findings: Findings) -> None:
+    if lies.elsewhere:
+        findings.warn(
+            f"{mesh.name}: lies neither on the points of the model {model} nor where the poses "
+            "have these, so it is but a part of what the photographs show, or lies in a frame or "
+            "unit of its own. Make one of this model if it does. [mesh.frame]"
+        )
 
 
 def _capture_from_colmap(
@@ -324,6 +329,31 @@ def _capture_from_colmap(
     return models[0], rigid_pose(scale * turn, centre - scale * from_centre)
 
 
+def old_axes_by_model(model: Path, frames: Sequence[Mapping[str, Any]]) -> bool | None:
+    """Whether a document's poses are those of this model of COLMAP with the axes that nerfstudio
+    gave them before 2023; None where the model does not tell, as it cannot be read or has not the
+    same cameras."""
+    if not model_files(model):
+        return None
+    try:
+        found = colmap_model(model)
+    except UsdBrdfError:
+        return None
+    theirs = _by_ends(found.names)
+    off: list[tuple[float, float]] = []
+    for frame in frames:
+        name, pose = frame.get("file_path"), stated_pose(frame.get("transform_matrix"))
+        k = _longest_end(PurePosixPath(name), theirs) if isinstance(name, str) else None
+        if pose is not None and k is not None:
+            start = world_from_camera(found.camera_from_world[k])
+            old, same = OLD_NERFSTUDIO @ start, start
+            off.append((np.abs(old - pose)[:3, :3].max(), np.abs(same - pose)[:3, :3].max()))
+    if len(off) < max(3, len(frames) / 2):
+        return None
+    by_old, by_same = np.median(off, axis=0)
+    return bool(by_old < by_same) if min(by_old, by_same) < _SAME_CAMERA else None
+
+
 def _by_ends(names: Sequence[str]) -> dict[tuple[str, ...], int | None]:
     """The numbers of names by each end of their paths, without suffix; None for several."""
     found: dict[tuple[str, ...], int | None] = {}
@@ -334,7 +364,7 @@ def _by_ends(names: Sequence[str]) -> dict[tuple[str, ...], int | None]:
     return found
 
 
-def _longest_end(path: Path, numbers: Mapping[tuple[str, ...], int | None]) -> int | None:
+def _longest_end(path: PurePath, numbers: Mapping[tuple[str, ...], int | None]) -> int | None:
     parts = path.with_suffix("").parts
     return next((numbers[parts[i:]] for i in range(len(parts)) if parts[i:] in numbers), None)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -20,12 +20,13 @@ from usdbrdf.capture.formats.nerfstudio_frames import (
     Applied,
     camera_axes,
     geometry_at_home,
-    lens_key,
+    old_axes_by_model,
     rigid_matrix,
     rolling_shutter,
     stated_pose,
     statements_beside,
 )
+from usdbrdf.capture.nerfstudio_lens import lens_of_frame
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.rigid_poses import is_camera_matrix
 from usdbrdf.capture.unrecognised import other_program
@@ -36,19 +37,12 @@ from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import MAX_SIDE, image_size
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
-from usdbrdf.model.lens import Curve, Lens, whole_sphere
+from usdbrdf.model.lens import Lens, whole_sphere
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions, UpAxis
 
 NAME = "transforms"
 DESCRIPTION = DESCRIPTIONS[NAME]
-_CURVES: dict[str, Curve] = {
-    "PINHOLE": "perspective", "SIMPLE_PINHOLE": "perspective", "OPENCV": "perspective",
-    "PERSPECTIVE": "perspective", "SIMPLE_RADIAL": "perspective", "RADIAL": "perspective",
-    "FULL_OPENCV": "perspective", "FISHEYE": "fisheye", "OPENCV_FISHEYE": "fisheye",
-    "FISHEYE624": "fisheye", "EQUIRECTANGULAR": "equirectangular",
-}  # fmt: skip
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
 # Folder of the reconstruction that old documents were made of.
 _COLMAP = "colmap/sparse/0"
 # No number in a document means anything beyond this; nor, where it must be positive, below its
@@ -228,12 +222,16 @@ def _captured(
         said := other_program(source)
     ):
         raise InputRefused(f"{source}: {said}. [capture.format]")
-    legacy = "applied_transform" not in document and (source.parent / _COLMAP).is_dir()
+    unsaid = "applied_transform" not in document and (source.parent / _COLMAP).is_dir()
+    known = old_axes_by_model(source.parent / _COLMAP, frames) if unsaid else False
+    legacy = known is None or known
     if legacy:
+        how = "are" if known else "are taken for"
+        doubt = "" if known else "; state applied_transform if they are not"
         findings.warn(
             f"{source.name}: {_COLMAP} lies beside it and it states no applied_transform, so its "
-            "poses are taken for those of nerfstudio before 2023, whose axes are undone; state "
-            "applied_transform if they are not. [capture.legacy]"
+            f"poses {how} those of nerfstudio before 2023, whose axes are undone{doubt}. "
+            "[capture.legacy]"
         )
     capture = _Capture(
         source=source,
@@ -277,7 +275,11 @@ def _record(
         return None
     width, height = capture.pixels(frame, "w"), capture.pixels(frame, "h")
     stated = width is not None and height is not None
-    lens = _lens(capture, frame, name)
+    lens = lens_of_frame(
+        {**capture.document, **frame},
+        partial(capture.number, frame),
+        lambda said: capture.refuse(f"the frame {name!r} {said}", "capture.camera"),
+    )
     needed = capture.images or not stated
     path = capture.pictured.of(name) if needed else capture.source.parent / name
     if path is None:
@@ -399,65 +401,6 @@ def _why_unlike(
     return (
         f"the image is {width} x {height} pixels, but {first!r}, which has the same intrinsics and "
         f"states no w and h either, is {size[0]} x {size[1]}"
-    )
-
-
-def _lens(capture: _Capture, frame: Mapping[str, Any], name: str) -> Lens:
-    """What camera_model, or instant-ngp's is_fisheye, and the distortion of a frame, else of the
-    document, say.
-
-    k1 to k4 are coefficients of r^2 to r^8, as nerfstudio has them; where k5 or k6 stand beside
-    them, k4 to k6 are OpenCV's, which divide.
-    """
-    fisheye = frame.get("is_fisheye", capture.document.get("is_fisheye"))
-    usual = lens_key({**capture.document, **frame})
-    usual = usual or ("OPENCV_FISHEYE" if fisheye is True else "PINHOLE")
-    stated = frame.get("camera_model", capture.document.get("camera_model"))
-    model = usual if stated is None else stated.upper() if isinstance(stated, str) else stated
-    if not isinstance(model, str) or model not in _CURVES:
-        raise capture.refuse(
-            f"the frame {name!r} has the camera model {(usual if stated is None else stated)!r} "
-            f"(known: {', '.join(_CURVES)}). "
-            "Undistort the images to a pinhole camera first.",
-            "capture.camera",
-        )
-    curve = _CURVES[model]
-    if curve == "equirectangular":
-        return Lens(curve=curve)
-    listed = frame.get("distortion_params", capture.document.get("distortion_params"))
-    if listed is not None:
-        return _listed_lens(capture, curve, listed, name)
-    number = {key: capture.number(frame, key) for key in _DISTORTION}
-    k1, k2, k3, k4, k5, k6, p1, p2, s1, s2, s3, s4 = (value or 0.0 for value in number.values())
-    divides = number["k5"] is not None or number["k6"] is not None
-    return Lens(
-        curve=curve,
-        radial=(k1, k2, k3) if divides else (k1, k2, k3, k4),
-        divisor=(k4, k5, k6) if divides else (),
-        tangential=(p1, p2),
-        prism=(s1, s2, s3, s4),
-    )
-
-
-def _listed_lens(capture: _Capture, curve: Curve, listed: object, name: str) -> Lens:
-    """nerfstudio's distortion_params: k1 to k4, p1, p2; or the twelve of Aria's FISHEYE624."""
-    sound = isinstance(listed, list) and all(type(n) in (int, float) for n in listed)
-    if not (sound and isinstance(listed, list) and len(listed) in (6, 12)):
-        raise capture.refuse(
-            f"the distortion_params of the frame {name!r} are not 6 or 12 numbers. Correct them.",
-            "capture.camera",
-        )
-    numbers = [float(n) for n in listed]
-    if len(numbers) == 6:
-        k1, k2, k3, k4, p1, p2 = numbers
-        return Lens(curve=curve, radial=(k1, k2, k3, k4), tangential=(p1, p2))
-    p0, p1, s0, s1, s2, s3 = numbers[6:]
-    return Lens(
-        curve=curve,
-        radial=tuple(numbers[:6]),
-        tangential=(p1, p0),
-        prism=(s0, s1, s2, s3),
-        radial_first=True,
     )
 
 

@@ -1,0 +1,70 @@
+"""Exposures as cameras write them into photographs, by the EXIF standard (CIPA DC-008)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from tests.scenes import edited, make_capture
+from usdbrdf.capture.adapters import read_scan
+from usdbrdf.files.exif import Settings, exif_settings
+from usdbrdf.options import IngestOptions
+
+_ISO = "Exif:PhotographicSensitivity"
+
+
+@pytest.mark.parametrize(
+    ("said", "settings"),
+    [
+        ({"ExposureTime": 0.01, "FNumber": 4.0, _ISO: 200}, (0.01, 4.0, 200)),
+        # In stops alone: 2^-7 s, f/4.
+        ({"Exif:ShutterSpeedValue": 7.0, "Exif:ApertureValue": 4.0}, (2**-7, 4.0, None)),
+        ({"ExposureTime": 0.01, "Exif:ApertureValue": 4.0}, (0.01, 4.0, None)),
+        # 0/0 and 1/0, as of lenses without contacts and of programs.
+        ({"ExposureTime": math.nan, "FNumber": math.nan, _ISO: 0}, (None, None, None)),
+        ({"ExposureTime": math.inf, "FNumber": 0.0}, (None, None, None)),
+        # Beyond two bytes, the other tags alone, and several values.
+        ({_ISO: 65535, "Exif:RecommendedExposureIndex": 102400}, (None, None, 102400)),
+        ({"Exif:StandardOutputSensitivity": 400}, (None, None, 400)),
+        ({_ISO: (200, 200)}, (None, None, 200)),
+    ],
+)
+def test_settings_are_told_in_any_of_the_ways_of_the_standard(monkeypatch, said, settings):
+    monkeypatch.setattr("usdbrdf.files.exif.header_of", lambda _, names: [*map(said.get, names)])
+    assert exif_settings(None) == pytest.approx(Settings(*settings))
+
+
+def _photographs(tmp_path, said):
+    """A room whose photographs say these EXIF data, by their numbers."""
+    made = make_capture(tmp_path / "capture")
+    with edited(made.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            del frame["exposure_time"], frame["saturation_radiance"], frame["noise_floor_radiance"]
+            frame["file_path"] = f"frames/{i:04d}.jpg"
+            spec = oiio.ImageSpec(32, 24, 3, "uint8")
+            for name, value in said(i).items():
+                spec.attribute(name, value)
+            output = oiio.ImageOutput.create(str(made.folder / frame["file_path"]))
+            assert output.open(str(made.folder / frame["file_path"]), spec)
+            assert output.write_image(np.full((24, 32, 3), 100 + i, np.uint8))
+            assert output.close()
+            made.image(i).unlink()
+    return read_scan(made.folder, IngestOptions(assume_srgb=True))
+
+
+def test_exposures_in_stops_are_divided_out(tmp_path):
+    scan = _photographs(
+        tmp_path, lambda i: {"Exif:ShutterSpeedValue": 5.0 + i % 3, "Exif:ApertureValue": 4.0}
+    )
+    assert any("divided out (2.0 stops)" in sentence for sentence in scan.warnings)
+
+
+def test_apertures_that_some_photographs_do_not_tell_are_not_taken_for_f1(tmp_path):
+    """They would be 16 times as bright as those of f/4 beside them."""
+    told = {"ExposureTime": 0.01}
+    scan = _photographs(tmp_path, lambda i: told | ({"FNumber": 4.0} if i % 2 else {}))
+    assert any("EXIF data are not compared" in sentence for sentence in scan.warnings)
+    assert len(np.unique(scan.frames.saturation_radiance)) == 1

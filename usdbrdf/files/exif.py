@@ -1,0 +1,115 @@
+"""How much light a photograph was given, by what its camera wrote into its header."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from usdbrdf.errors import ImageRefused
+from usdbrdf.files.images import header_of
+
+# Stops between a stated time and a stated shutter's speed: below the first both are exact, as of
+# telephones; beyond the second, which the names on dials do not reach, one of them is wrong.
+_EXACT_STOPS, _ROUNDED_STOPS = 0.005, 0.15
+# ISO speeds beyond what two bytes hold are written as the largest that they do.
+_LARGEST_SPEED = 65535
+_TIME, _STOPS = "ExposureTime", "Exif:ShutterSpeedValue"
+_NUMBER, _APERTURE = "FNumber", "Exif:ApertureValue"
+_SPEEDS = (
+    "Exif:PhotographicSensitivity", "Exif:ISOSpeed", "Exif:RecommendedExposureIndex",
+    "Exif:StandardOutputSensitivity",
+)  # fmt: skip
+_NAMES = (_TIME, _STOPS, _NUMBER, _APERTURE, *_SPEEDS)
+
+
+class Settings(NamedTuple):
+    """Seconds, f-number and ISO speed of a photograph, None where they are not told."""
+
+    time: float | None
+    number: float | None
+    speed: float | None
+
+    @property
+    def light(self) -> float | None:
+        """Exposure time times ISO / 100, over the square of the f-number; what is not told counts
+        as ISO 100 and f/1. None without an exposure time."""
+        if self.time is None:
+            return None
+        return self.time * (self.speed or 100) / 100 / (self.number or 1) ** 2
+
+
+def exif_settings(path: Path) -> Settings:
+    """What the EXIF data of a photograph say, in numbers or else in stops (APEX).
+
+    A dial's 1/30 or 1/125 is a name: the shutter opens for 1/32 and 1/128. Where the shutter's
+    speed in stops says so, that is taken, as a whole, half or third stop."""
+    said = dict(zip(_NAMES, header_of(path, _NAMES), strict=True))
+    time, stops = _positive(said[_TIME]), _finite(said[_STOPS])
+    if time is not None and stops is not None:
+        time = _shutter_time(time, stops)
+    elif stops is not None:
+        time = _power(-stops)
+    number, aperture = _positive(said[_NUMBER]), _finite(said[_APERTURE])
+    if number is None and aperture is not None:
+        number = _power(aperture / 2)
+    speeds = [_positive(_first(said[name])) for name in _SPEEDS]
+    known = [speed for speed in speeds if speed is not None and speed != _LARGEST_SPEED]
+    return Settings(time, number, next(iter(known), None))
+
+
+def exif_exposure(path: Path) -> float | None:
+    """How much light a photograph was given, see ``Settings.light``."""
+    return exif_settings(path).light
+
+
+def exif_exposures(paths: Sequence[Path]) -> tuple[list[float] | None, bool]:
+    """The light of each of several photographs, None where it cannot be compared, as some tell a
+    time, an f-number or a speed and others do not; and whether any tells anything. Files that
+    cannot be read, of which the reader of their pixels will tell, have that of another."""
+    known: dict[Path, Settings] = {}
+    for path in paths:
+        with suppress(ImageRefused):
+            known[path] = exif_settings(path)
+    columns = list(zip(*known.values(), strict=True))
+    alike = all(len({one is None for one in column}) == 1 for column in columns)
+    lights = {path: settings.light for path, settings in known.items()}
+    other = next(iter(lights.values()), None)
+    found = [lights.get(path) or other for path in paths]
+    exposures = [light for light in found if alike and light is not None]
+    return (
+        exposures if len(exposures) == len(paths) else None,
+        any(one is not None for column in columns for one in column),
+    )
+
+
+def _first(value: object) -> object:
+    return value[0] if isinstance(value, tuple) and value else value
+
+
+def _finite(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if math.isfinite(value) else None
+
+
+def _positive(value: object) -> float | None:
+    number = _finite(value)
+    return number if number is not None and number > 0 else None
+
+
+def _power(stops: float) -> float | None:
+    """2 to that power, None where no camera means it."""
+    return 2.0**stops if abs(stops) < 64 else None
+
+
+def _shutter_time(time: float, stops: float) -> float:
+    """For how long a shutter was open whose exposure time is stated, and its speed: the latter, set
+    to the nearest stop of a dial, where they differ by no more than names do."""
+    if not _EXACT_STOPS < abs(stops + math.log2(time)) < _ROUNDED_STOPS:
+        return time
+    return float(
+        2 ** -min(round(3 * stops) / 3, round(2 * stops) / 2, key=lambda v: abs(v - stops))
+    )

@@ -1,0 +1,50 @@
+"""What the header of a Radiance file (.hdr) says of its pixels: by what they have been multiplied,
+and of which primaries they are. Its format is that of Radiance's "filefmts" reference."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.files.tables import beginning_of
+from usdbrdf.model.arrays import Double
+
+_LONGEST = 1 << 16  # bytes of a header
+_MARKS = (b"#?RADIANCE", b"#?RGBE")
+_LINE = re.compile(rb"^(EXPOSURE|COLORCORR|PRIMARIES)=(.*)$", re.MULTILINE)
+
+
+def factors_of_hdr(path: Path) -> Double:
+    """(3,) what the pixels of a Radiance file are to be divided by to be radiance again, of R, G
+    and B: the product of all that its header states; 1 for other files and where nothing is."""
+    factors = np.ones(3)
+    for key, numbers in _stated(path):
+        if key != b"PRIMARIES" and len(numbers) in (1, 3) and (numbers > 0).all():
+            factors = factors * numbers
+    return factors
+
+
+def primaries_of_hdr(path: Path) -> tuple[float, ...]:
+    """x, y of red, green, blue and white; () where they are not stated."""
+    stated = [numbers for key, numbers in _stated(path) if key == b"PRIMARIES"]
+    sound = stated and len(stated[-1]) == 8
+    return tuple(float(number) for number in stated[-1]) if sound else ()
+
+
+def _stated(path: Path) -> list[tuple[bytes, Double]]:
+    """Lines of finite numbers, in their order."""
+    head = beginning_of(path, _LONGEST)
+    if not head.startswith(_MARKS):
+        return []
+    lines = _LINE.findall(head.replace(b"\r", b"").partition(b"\n\n")[0])
+    found = []
+    for key, said in lines:
+        try:
+            numbers = np.array(said.split(), np.float64)
+        except ValueError:
+            continue
+        if np.isfinite(numbers).all():
+            found.append((key, numbers))
+    return found
