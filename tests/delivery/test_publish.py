@@ -571,6 +571,10 @@ def test_stand_ins_have_few_triangles_and_lie_beside_each_mesh(room, tmp_path):
         corners = np.array(proxy.GetFaceVertexIndicesAttr().Get())
         assert len(corners) == 3 * count
         assert corners.max() < len(proxy.GetPointsAttr().Get())
+        # Where there are none, validators of others find it.
+        normals = np.array(proxy.GetNormalsAttr().Get())
+        assert (len(normals), proxy.GetNormalsInterpolation()) == (3 * count, "faceVarying")
+        assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
         assert 4 <= count <= (200 if prim.GetPath() == grid else 12)
     assert own_findings(stage) == []
     # Nothing of them is loaded before the payload is.
