@@ -328,7 +328,10 @@ def test_an_object_without_a_name_is_called_by_its_identifier(room):
     _, atlas = measured_atlas(room.asset)
     objects_ = [replace(obj, label="  ") for obj in atlas.scene.objects]
     unnamed = SimpleNamespace(
-        texels=atlas.texels, emission=atlas.emission, scene=SimpleNamespace(objects=objects_)
+        texels=atlas.texels,
+        emission=atlas.emission,
+        emissive=atlas.emissive,
+        scene=SimpleNamespace(objects=objects_),
     )
     found = lamps(unnamed, "Z")
     assert found
