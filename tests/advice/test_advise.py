@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 import usdbrdf
 from tests.advice.plate_room import ROOM, frame_poses, highlight, mesh, write_capture
-from usdbrdf.advice.words import reason
+from usdbrdf.advice.words import exposure_in_words, reason
 from usdbrdf.asset.advice import AdvisedObject, read_advice, write_advice
 from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
@@ -204,3 +204,6 @@ def test_a_reason_is_a_sentence():
     assert told == f"The reflection of lamp {better}; what reflects {better}."
     assert reason([one("")], 0, [], 0, []).startswith("What reflects on ball")
     assert reason([], 0, [], 1, ["lamp"]) == "lamp without clipping."
+    assert reason([], 233.4, [], 0, []) == "230 m^2 that no frame shows."
+    assert reason([], 0.0451, ["rug"], 0, []) == "0.045 m^2 that no frame shows (rug)."
+    assert exposure_in_words(127.0, True) == "130 s"

@@ -11,6 +11,7 @@ from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layers.scan_layer import write_pending_layer
 from usdbrdf.delivery.package import stage_in_look
 from usdbrdf.errors import UsageError
+from usdbrdf.validation.validate import own_findings
 
 
 def test_every_look_is_there(room, tmp_path):
@@ -28,6 +29,8 @@ def test_every_look_is_there(room, tmp_path):
     for name, surface in surfaces_of(extracted(output, tmp_path / "x")).items():
         assert np.array_equal(surface.material.diffuse, before[name].material.diffuse)
         assert np.array_equal(surface.material.emission, before[name].material.emission)
+    # What runs our rules on any stage finds no layer missing that lies in the package.
+    assert own_findings(Usd.Stage.Open(str(output))) == []
     assert packed(room, tmp_path, "again.usdz", whole=True).read_bytes() == output.read_bytes()
 
 

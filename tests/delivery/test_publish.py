@@ -78,6 +78,26 @@ def test_a_version_needs_nothing_else_and_is_what_the_asset_was(room, tmp_path):
     assert own_findings(stage) == []
 
 
+def test_no_version_says_where_the_capture_lay(room, tmp_path):
+    def said_by(file):
+        layer = Sdf.Layer.OpenAsAnonymous(str(file))
+        return layer.customLayerData["usdbrdf"]["parameters"]
+
+    for name in ("scan", "photographs"):
+        layer = Sdf.Layer.OpenAsAnonymous(str(room.asset.folder / f"layers/{name}.usdc"))
+        about = layer.customLayerData
+        about["usdbrdf"]["parameters"] = {"adapter": "usd", "places": {"capture": "../../home/me"}}
+        layer.customLayerData = about
+        assert layer.Export(str(room.asset.folder / f"layers/{name}.usdc"))
+    for photographs in (True, False):
+        options = PublishOptions(photographs=photographs)
+        version = Path(publish(room.asset.folder, tmp_path / "dest", options)["publish"])
+        assert said_by(version / "layers/scan.usdc") == {"adapter": "usd"}
+        assert (version / "layers/photographs.usdc").is_file() == photographs
+        if photographs:
+            assert said_by(version / "layers/photographs.usdc") == {"adapter": "usd"}
+
+
 def test_versions_follow_each_other_and_never_change(room, tmp_path):
     dest, folder = tmp_path / "new" / "dest", room.asset.folder
     publish(folder, dest)
@@ -551,6 +571,10 @@ def test_stand_ins_have_few_triangles_and_lie_beside_each_mesh(room, tmp_path):
         corners = np.array(proxy.GetFaceVertexIndicesAttr().Get())
         assert len(corners) == 3 * count
         assert corners.max() < len(proxy.GetPointsAttr().Get())
+        # Where there are none, validators of others find it.
+        normals = np.array(proxy.GetNormalsAttr().Get())
+        assert (len(normals), proxy.GetNormalsInterpolation()) == (3 * count, "faceVarying")
+        assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
         assert 4 <= count <= (200 if prim.GetPath() == grid else 12)
     assert own_findings(stage) == []
     # Nothing of them is loaded before the payload is.

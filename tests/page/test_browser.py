@@ -94,6 +94,23 @@ def test_objects_are_sorted_filtered_and_opened_by_keys(opened, page_file):
     assert detail.locator("img").count() == 2
 
 
+def test_no_error_reads_as_none_and_what_shines_is_not_said_to_lack_pixels(
+    opened, page_file, tmp_path
+):
+    data = data_of(page_file.read_text("utf-8"))
+    data["objects"][0] |= {"status": "measured", "f0": None, "phi": 0.0042, "phi_error": 0.0031}
+    data["objects"][1] |= {"status": "lamp"}
+    data["objects"][1].pop("costs", None)
+    (tmp_path / "page.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "page.html").as_uri())
+    row = shown.locator(f"#table tbody tr[data-prim='{data['objects'][0]['prim']}']")
+    assert "0.004 \u00b1 0.003" in row.inner_text()
+    name = shown.get_by_role("button", name=data["objects"][1]["label"], exact=True)
+    name.press("Enter")
+    detail = shown.locator(f"#{name.get_attribute('aria-controls')}")
+    assert "What shines by itself is not fitted." in detail.inner_text()
+
+
 def test_the_slider_moves_over_the_views(opened, page_file):
     shown = opened(page_file.as_uri())
     slider, compared = shown.locator("#at"), shown.locator(".compare")

@@ -23,7 +23,14 @@ from usdbrdf.model.material import turned_up
 from usdbrdf.page import objects, views
 from usdbrdf.page.capture import findings
 from usdbrdf.page.daylight import _around, daylight
-from usdbrdf.page.pictures import _BACKGROUND, Seen, SurfaceMap, part_around, pictures_of_map
+from usdbrdf.page.pictures import (
+    _BACKGROUND,
+    Seen,
+    SurfaceMap,
+    part_around,
+    pictures_of_map,
+    status_of,
+)
 from usdbrdf.page.report import page, report, shows_most
 from usdbrdf.page.room import lamps, with_the_weakest_as_one
 from usdbrdf.transport.environment import NO_SUN, Environment, Sun, directions_of_pixels
@@ -94,7 +101,9 @@ def test_a_few_texels_that_mirror_a_lamp_are_no_lamp(room):
     own = atlas.texels.of_object(0)
     assert not atlas.emission[own].any()
     emission = atlas.emission.copy()
-    some = SimpleNamespace(texels=atlas.texels, emission=emission, scene=atlas.scene)
+    some = SimpleNamespace(
+        texels=atlas.texels, emission=emission, emissive=atlas.emissive, scene=atlas.scene
+    )
     emission[own] = 1e-6 * emission.max()
     assert len(lamps(some, "Z")) == len(found)
     emission[own] = emission.max()
@@ -319,7 +328,10 @@ def test_an_object_without_a_name_is_called_by_its_identifier(room):
     _, atlas = measured_atlas(room.asset)
     objects_ = [replace(obj, label="  ") for obj in atlas.scene.objects]
     unnamed = SimpleNamespace(
-        texels=atlas.texels, emission=atlas.emission, scene=SimpleNamespace(objects=objects_)
+        texels=atlas.texels,
+        emission=atlas.emission,
+        emissive=atlas.emissive,
+        scene=SimpleNamespace(objects=objects_),
     )
     found = lamps(unnamed, "Z")
     assert found
@@ -344,6 +356,16 @@ def test_texels_that_mirror_daylight_are_no_lamp(room):
     _, atlas = measured_atlas(room.asset)
     strength = max(sum(lamp["intensity"]) for lamp in lamps(atlas, "Z"))
     assert lamps(atlas, "Z", 1e4 * strength) == []
+
+
+def test_things_that_shine_in_part_are_no_lamps_by_name(room):
+    _, atlas = measured_atlas(room.asset)
+    shines = next(i for i in range(len(atlas.scene.objects)) if status_of(atlas, i, None) == "lamp")
+    own, name = atlas.texels.of_object(shines), atlas.scene.objects[shines].name
+    assert name in {lamp["label"] for lamp in lamps(atlas, "Z")}
+    atlas.emission[own.start + (own.stop - own.start) // 8 : own.stop] = 0
+    atlas.emissive[own.start + (own.stop - own.start) // 8 : own.stop] = False
+    assert f"part of {name}" in {lamp["label"] for lamp in lamps(atlas, "Z")}
 
 
 def test_the_findings_say_what_is_known_of_the_light_from_outside():

@@ -20,15 +20,16 @@ from usdbrdf.asset.review import (
     write_review,
 )
 from usdbrdf.errors import InputRefused
-from usdbrdf.page.objects import why
+from usdbrdf.page.capture import findings
+from usdbrdf.page.objects import undetermined_because, why
 
 CHAIR, WALL = "/room/geo/Stuhl_No_1/Stuhl_No_1", "/room/geo/wall/wall"
 
 
 def fit(**numbers):
-    usual = {"status": "measured", "phi": 0.25, "psi": 0.5}
+    usual = {"status": "measured", "phi": 0.25, "psi": 0.5, "evidence": 0.5}
     return FittedObject(
-        prim_path=CHAIR, identifier="chair", cost=0.0, evidence=0.5, target_frame=0,
+        prim_path=CHAIR, identifier="chair", cost=0.0, target_frame=0,
         num_pixels=9, method="views", **usual | numbers,
     )  # fmt: skip
 
@@ -55,6 +56,25 @@ def test_of_what_is_seen_through_page_and_run_say_so():
     assert not fit().doubts
     (told,) = found.doubts
     assert told.startswith("chair: 45% of its light changes between views ")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "reason", "told"),
+    [
+        ({}, "prior", "1 is not determined: no photograph shows a clear highlight"),
+        ({"evidence": math.nan}, "sparse", "1 is seen in too few pixels for a fit"),
+        ({"contradiction": 0.45}, "contradicted", "The views of 1 contradict that it is a surface"),
+        ({"directive": "glass", "evidence": math.nan}, "told", "1 was not fitted, by directive."),
+    ],
+)
+def test_the_page_tells_apart_why_numbers_are_not_determined(numbers, reason, told):
+    found = fit(status="prior", **numbers)
+    assert undetermined_because(found, "prior") == reason
+    assert undetermined_because(found, "lamp") == "lamp"
+    steps = {"texture": {}, "shade": {}}
+    (said,) = findings(steps, [reason], True)[1:]
+    assert said.startswith(told)
+    assert findings(steps, [reason] * 3, True)[1].replace("The views of 3", "3").startswith("3 ")
 
 
 def test_what_is_said_comes_back_and_is_metadata_alone(built):

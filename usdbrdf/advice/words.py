@@ -120,11 +120,16 @@ def looked_at(survey: Survey, choice: Choice, objects: Sequence[SceneObject]) ->
 def exposure_in_words(time_s: float, known: bool) -> str:
     """1/500 s, 2.5 s; where nobody said how long the frames were exposed, in stops."""
     if known:
-        return f"1/{1 / time_s:.0f} s" if time_s < 0.4 else f"{time_s:.2g} s"
+        return f"1/{1 / time_s:.0f} s" if time_s < 0.4 else f"{_two_digits(time_s)} s"
     stops = math.log2(time_s)
     if abs(stops) < 0.05:
         return "as before"
     return f"{abs(stops):.1f} stops {'shorter' if stops < 0 else 'longer'} than before"
+
+
+def _two_digits(value: float) -> str:
+    """To two digits as people write them: 230, 61, 0.4."""
+    return f"{float(f'{value:.2g}'):.9g}"
 
 
 def reason(
@@ -140,7 +145,7 @@ def reason(
         said.append(f"{what} on {one.identifier}: {_better(one)}")
     if new_m2 > 0:
         on = f" ({', '.join(new_on)})" if new_on else ""
-        said.append(f"{new_m2:.2g} m^2 that no frame shows{on}")
+        said.append(f"{_two_digits(new_m2)} m^2 that no frame shows{on}")
     if clipped_m2 > 0:
         on = ", ".join(clipped_on) or "what is bright"
         said.append(f"{on} without clipping")
@@ -178,7 +183,7 @@ def lines(summary: Mapping[str, Any]) -> list[str]:
     if summary["unseen_area"] > 0:
         share = summary["seen_area"] / summary["unseen_area"]
         said.append(
-            f"{summary['unseen_area']:.2g} m^2 can be seen that no frame shows; these show "
-            f"{share:.0%} of it"
+            f"{_two_digits(summary['unseen_area'])} m^2 can be seen that no frame shows; these "
+            f"show {share:.0%} of it"
         )
     return [*said, f"{summary['layer']}: written"]

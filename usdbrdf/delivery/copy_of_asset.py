@@ -84,6 +84,7 @@ def write_copy(
 
     def edit(layer: Sdf.Layer, is_root: bool) -> bool:
         changed = space != WORKING_SPACE and convert_layer(layer, textures, space)
+        changed |= _forget_places(layer)
         if layer.customLayerData.get("usdbrdf", {}).get("role") == "edits":
             layer.documentation = "What the artist's layer said when this copy was made."
             changed = True
@@ -107,3 +108,14 @@ def write_copy(
         add_proxies(folder / root, folder / found.places[canonical(asset.contents_layer)], proxies)
     refuse_incomplete(folder / root)
     return found
+
+
+def _forget_places(layer: Sdf.Layer) -> bool:
+    """Take out where the capture lay, which the work folder is run again from: a copy has no way
+    there, and names of folders are nobody else's. Returns whether anything said it."""
+    about = layer.customLayerData
+    if "places" not in about.get("usdbrdf", {}).get("parameters", {}):
+        return False
+    del about["usdbrdf"]["parameters"]["places"]
+    layer.customLayerData = about
+    return True

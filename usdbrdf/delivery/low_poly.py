@@ -46,7 +46,7 @@ READER, NORMALS = "LowPolyStReader", "NormalTexture"
 # How far the scan may lie from the coarse surface, as a share of the box around the object.
 _REACH = 0.05
 # Coarse faces that lean more than this from each other have an edge between them.
-_CREASE_ANGLE_DEG = 60.0
+CREASE_ANGLE_DEG = 60.0
 # Texels of an object, whose points take some 200 bytes each.
 _MOST_TEXELS = 1 << 23
 _PURPOSES = (UsdShade.Tokens.full, UsdShade.Tokens.preview)
@@ -235,7 +235,7 @@ def _unwrapped(
                       for i, part in enumerate(parts)),
         points=points,
         triangles=triangles,
-        corner_normals=corner_normals(points, triangles, _CREASE_ANGLE_DEG),
+        corner_normals=corner_normals(points, triangles, CREASE_ANGLE_DEG),
         face_object=owner,
     )  # fmt: skip
     sides = np.array([_texel_side(part, uses) for part in parts], np.float32)
@@ -249,7 +249,7 @@ def _unwrapped(
             objects=(_object(parts[i].surface.name, 0, len(own)),),
             points=own_points,
             triangles=own,
-            corner_normals=corner_normals(own_points, own, _CREASE_ANGLE_DEG),
+            corner_normals=corner_normals(own_points, own, CREASE_ANGLE_DEG),
             face_object=np.zeros(len(own), np.int32),
             corner_uv=corner_uv[faces],
         )

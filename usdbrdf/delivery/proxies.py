@@ -11,7 +11,9 @@ from pxr import Sdf, Usd, UsdGeom
 from usdbrdf.asset.header import LAYOUT, Provenance, new_layer, read_header
 from usdbrdf.asset.layers.author import attribute, define, export, over, relationship
 from usdbrdf.asset.readers.compose import open_stage
+from usdbrdf.delivery.low_poly import CREASE_ANGLE_DEG
 from usdbrdf.geometry.mesh_clean import decimated
+from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Float, Int
 
 PROXIES = "proxies.usdc"
@@ -77,9 +79,11 @@ def _meshes_of_objects(stage: Usd.Stage, layers: Path) -> list[tuple[Usd.Prim, F
 def _author_proxy(proxy: Sdf.PrimSpec, prim: Usd.Prim, points: Float, corners: Int) -> None:
     mesh, counts = UsdGeom.Mesh(prim), np.full(len(corners), 3, np.int32)
     extent = np.stack([points.min(axis=0), points.max(axis=0)])
+    normals = corner_normals(points, corners, CREASE_ANGLE_DEG).reshape(-1, 3)
     attribute(proxy, "points", Types.Point3fArray, points)
     attribute(proxy, "faceVertexCounts", Types.IntArray, counts)
     attribute(proxy, "faceVertexIndices", Types.IntArray, corners.reshape(-1))
+    attribute(proxy, "normals", Types.Normal3fArray, normals, interpolation="faceVarying")
     attribute(proxy, "extent", Types.Float3Array, extent)
     attribute(proxy, "subdivisionScheme", Types.Token, UsdGeom.Tokens.none, uniform=True)
     attribute(proxy, "doubleSided", Types.Bool, mesh.GetDoubleSidedAttr().Get(), uniform=True)

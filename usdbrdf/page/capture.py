@@ -134,7 +134,8 @@ def _from_above(
 def findings(
     found: Mapping[str, Mapping[str, Any]], words: Sequence[str], radiometric: bool
 ) -> list[str]:
-    """What was found, what not and why, in sentences. words: of each object, see ``status_of``."""
+    """What was found, what not and why, in sentences. words: of each object, see ``status_of`` and
+    ``undetermined_because``."""
     count = {word: words.count(word) for word in set(words)}
     total = len(words)
     told = [
@@ -145,6 +146,19 @@ def findings(
             f"{prior} {'is' if prior == 1 else 'are'} not determined: no photograph shows a clear "
             "highlight, so the numbers are what remains likely, with an upper bound."
         )
+    if sparse := count.get("sparse"):
+        told.append(
+            f"{sparse} {'is' if sparse == 1 else 'are'} seen in too few pixels for a fit: the "
+            "numbers are a guess."
+        )
+    if contradicted := count.get("contradicted"):
+        told.append(
+            f"The views of {contradicted} contradict that "
+            f"{'it is a surface' if contradicted == 1 else 'they are surfaces'}: something is seen "
+            f"through {'it or in it' if contradicted == 1 else 'them or in them'}."
+        )
+    if left := count.get("told"):
+        told.append(f"{left} {'was' if left == 1 else 'were'} not fitted, by directive.")
     if failed := count.get("failed"):
         told.append(
             f"The fit of {failed} failed: {'its' if failed == 1 else 'their'} photographs do not "
@@ -153,7 +167,7 @@ def findings(
     if unseen := count.get("unseen"):
         told.append(f"No photograph shows {unseen if unseen < total else 'any'} of them.")
     if lamps := count.get("lamp"):
-        told.append(f"{lamps} {'is a lamp' if lamps == 1 else 'are lamps'}, found by shining.")
+        told.append(f"{lamps} {'is a lamp' if lamps == 1 else 'are lamps'}.")
     texture, shade = found["texture"], found["shade"]
     if "measured_fraction" in texture:
         told.append(

@@ -168,6 +168,18 @@ def why(fit: FittedObject, status: str, shading: ShadedObject | None) -> str:
     return f"{explained} {known}{bound}"
 
 
+def undetermined_because(fit: FittedObject | None, status: str) -> str:
+    """One word about why the numbers of an object are not known: "told" where a person said that
+    nothing be fitted, "contradicted", "sparse" where too little was seen; else ``status``."""
+    if fit is None or status != "prior":
+        return status
+    if fit.directive in ("ignore", "glass"):
+        return "told"
+    if fit.is_contradicted:
+        return "contradicted"
+    return "sparse" if math.isnan(fit.evidence) else status
+
+
 def _by_directive(fit: FittedObject, shading: ShadedObject | None) -> str:
     """The same where a person said what is to be done; "" where the numbers speak."""
     if shading is not None and shading.directive == LAMP:

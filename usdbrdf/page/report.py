@@ -32,7 +32,7 @@ from usdbrdf.model.arrays import Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import ReportOptions
 from usdbrdf.page.capture import findings, frame_rows, room_map, summaries, warnings_of
-from usdbrdf.page.objects import object_rows
+from usdbrdf.page.objects import object_rows, undetermined_because
 from usdbrdf.page.pictures import (
     data_uri,
     objects_in_frames,
@@ -117,6 +117,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     fits = [_in_own_frames(atlas, obj.prim_path) for obj in atlas.scene.objects]
     known = [fit for fit in fits if fit is not None]
     words = [status_of(atlas, i, fit) for i, fit in enumerate(fits)]
+    reasons = [undetermined_because(fit, word) for fit, word in zip(fits, words, strict=True)]
     frames, found, advice = atlas.frames, summaries(place), read_advice(place)
     chosen = _frames_to_search(len(frames), known)
     where = objects_in_frames(seen.lit.rays, atlas.scene.face_object, len(words), frames.at(chosen))
@@ -144,7 +145,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
             "triangles": len(atlas.scene.triangles),
             "texels": len(atlas.texels),
         },
-        "findings": findings(found, words, bool(frames.radiometric)),
+        "findings": findings(found, reasons, bool(frames.radiometric)),
         "warnings": [
             sentence
             for sentence in warnings_of(found)

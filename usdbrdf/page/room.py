@@ -21,7 +21,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.material import turned_up
 from usdbrdf.options import PackageOptions, Surroundings
 from usdbrdf.page.daylight import area_of, daylight
-from usdbrdf.page.pictures import data_uri
+from usdbrdf.page.pictures import data_uri, status_of
 from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.rays import RayScene
 
@@ -49,7 +49,8 @@ def room_model(
     first  where the view opens, see ``first_look``: as ``camera`` looked
     lit    by prim, the lit texture as a picture
     lamps  where those are that shine, y up, with their intensity as points, in the asset's units of
-           radiance times m^2; the weakest of many are one
+           radiance times m^2; the weakest of many are one, and parts of things that are no lamps
+           say so
     area   m^2 of the surfaces that their light is spread over
     outside  see ``daylight``; the surroundings of ``lit`` are those of ``environment``
     """
@@ -124,6 +125,7 @@ def lamps(atlas: AssetMaps, up_axis: str, beside: float = 0.0) -> list[dict[str,
         if not power.any():
             continue
         weight = power.sum(axis=1)
+        whole = status_of(atlas, i, None) == "lamp"
         # A little before the surface, on the side that shines, so that it lights what is there.
         middle = np.average(texels.position[own], axis=0, weights=weight)
         facing = np.average(texels.geometric_normal[own], axis=0, weights=weight)
@@ -131,7 +133,7 @@ def lamps(atlas: AssetMaps, up_axis: str, beside: float = 0.0) -> list[dict[str,
         found.append(
             {
                 "prim": obj.prim_path,
-                "label": obj.name,
+                "label": obj.name if whole else f"part of {obj.name}",
                 "place": [round(float(value), 4) for value in place],
                 "intensity": [float(value) for value in power.sum(axis=0) / 4],
             }

@@ -100,8 +100,14 @@ class AssetStage:
             for path in expected
             if not path.is_file()
         }
-        if self.asset_root and self.asset and not self.asset.contents_layer.is_file():
-            missing[self.asset.contents_layer] = self.asset_root
+        root, asset = self.asset_root, self.asset
+        # A package has its layers inside, and is no folder.
+        if (
+            root
+            and asset
+            and not (root.GetFileFormat().IsPackage() or asset.contents_layer.is_file())
+        ):
+            missing[asset.contents_layer] = root
         return missing
 
     @cached_property

@@ -219,8 +219,10 @@
     const swatch = el('span', { class: 'swatch', style: `background: ${css(one.base_color)}` });
     const number = (value, error) => {
       if (one.status === 'lamp') return ['\u2013'];
-      const parts = [fixed(value)];
-      if (error !== null) parts.push(el('span', { class: 'error' }, ` \u00b1 ${fixed(error)}`));
+      // An error that would read as 0.00 gets another digit, and its number with it.
+      const digits = error !== null && error < 0.005 ? 3 : 2;
+      const parts = [fixed(value, digits)];
+      if (error !== null) parts.push(el('span', { class: 'error' }, ` \u00b1 ${fixed(error, digits)}`));
       return parts;
     };
     const detail = el('tr', { class: 'detail', id: `detail-${i}`, hidden: true }, el('td', { colspan: COLUMNS.length }));
@@ -300,7 +302,8 @@
 
   /* What lobes leave unexplained of the target frame, over phi and psi. */
   function evidence(one) {
-    if (!one.costs) return [el('h3', {}, 'Evidence'), el('p', { class: 'soft' }, 'Too few pixels for a plot.')];
+    const none = one.status === 'lamp' ? 'What shines by itself is not fitted.' : 'Too few pixels for a plot.';
+    if (!one.costs) return [el('h3', {}, 'Evidence'), el('p', { class: 'soft' }, none)];
     const { phis, psis, values } = one.costs;
     const [width, height, left, top, side] = [290, 232, 38, 8, 200];
     let best = [0, 0];
