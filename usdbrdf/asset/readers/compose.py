@@ -217,7 +217,8 @@ def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
     uv = None if asset.lighting else asset.uv_layer
     named = [*(layer for layer in reversed(layers) if layer != uv), *_beneath(asset)]
     try_layers(named, together=True)
-    for layer in (*named, asset.uv_layer, asset.lights_layer):
+    below = {asset.layer("texturing"): asset.uv_layer, asset.layer("shading"): asset.lights_layer}
+    for layer in (*named, *(part for whole, part in below.items() if whole in layers)):
         if layer.is_file():
             open_metadata(layer)  # which names it, where USD would name the stage made here
     root.subLayerPaths = [*map(str, named)]
