@@ -40,6 +40,7 @@ def calls(folder, other, out):
         "package": ["package", str(folder), "-o", str(out / "room.usdz")],
         "whole": ["package", str(folder), "-o", str(out / "room.usdz"), "--whole"],
         "publish": ["publish", str(folder), str(out / "versions")],
+        "relight": ["relight", str(folder), "-o", str(out / "lit.exr")],
         "validate": ["validate", str(folder)],
     }
 
@@ -166,7 +167,12 @@ def test_damage_to_where_the_photographs_are_is_a_finding(strange, capsys, conte
 @pytest.mark.fault("R7")
 @pytest.mark.parametrize("content", [b"", b"PXR-USDC", b"no layer at all"])
 @pytest.mark.parametrize(
-    ("name", "layer"), [("texture", "layers/photographs.usdc"), ("fit", "layers/lights.usda")]
+    ("name", "layer"),
+    [
+        ("texture", "layers/photographs.usdc"),
+        ("relight", "layers/photographs.usdc"),
+        ("fit", "layers/lights.usda"),
+    ],
 )
 def test_a_layer_that_cannot_be_read_is_named(
     converted, strange, tmp_path, capfd, name, layer, content

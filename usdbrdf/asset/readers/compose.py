@@ -67,6 +67,7 @@ def open_edited(asset: Asset) -> Usd.Stage:
     try_in_child(asset.root_layer, beside=beside)
     stage = open_stage(asset.root_layer)
     for file in beside:
+        open_metadata(file)  # which names it
         stage.GetSessionLayer().subLayerPaths.append(str(file))
     return _in_lighting(stage, asset)
 

@@ -31,7 +31,7 @@ def refuses_foreign(what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             except _STUMBLES as error:
                 said = " ".join(words_of(error).split())[:_MAX_LENGTH]
                 raise InputRefused(
-                    f"{_place_of(given)}: what the layers say of {what} is not what usdbrdf writes "
+                    f"{place_of(*given)}: what the layers say of {what} is not what usdbrdf writes "
                     f"there ({type(error).__name__}: {said}). Take the layers from a copy of the "
                     "asset, or run `usdbrdf convert` again with --discard. [stage.content]"
                 ) from error
@@ -41,7 +41,8 @@ def refuses_foreign(what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     return of_reader
 
 
-def _place_of(given: tuple[Any, ...]) -> str:
+def place_of(*given: Any) -> str:
+    """The file by which a stage, or that of a prim, the first of ``given``, is to be named."""
     place = next(each for each in given if isinstance(each, Usd.Stage | Usd.Prim))
     layer = (place.GetStage() if isinstance(place, Usd.Prim) else place).GetRootLayer()
     # Of a stage that we put together, the strongest of its layers.

@@ -29,7 +29,7 @@ from usdbrdf.asset.properties import (
     ShadedObject,
     facts_of,
 )
-from usdbrdf.asset.readers.foreign import refuses_foreign
+from usdbrdf.asset.readers.foreign import place_of, refuses_foreign
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Float, Int
@@ -129,7 +129,7 @@ def capture_camera(stage: Usd.Stage) -> UsdGeom.Camera:
         if prim.IsA(UsdGeom.Camera) and authored(prim, _PINHOLE) is not None:
             return UsdGeom.Camera(prim)
     raise InputRefused(
-        f"{stage.GetRootLayer().identifier}: no camera of the stage has taken photographs "
+        f"{place_of(stage)}: no camera of the stage has taken photographs "
         "(usdBrdf:capture:pinhole). Run ingest again. [stage.camera]"
     )
 
@@ -162,7 +162,7 @@ def scene_from_stage(stage: Usd.Stage) -> Scene:
     prims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh) and is_measured(p, OBJECT)]
     if not prims:
         raise InputRefused(
-            f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
+            f"{place_of(stage)}: no mesh of the stage has a usdBrdf:label. "
             "Run `usdbrdf ingest` again. [stage.objects]"
         )
     given = (record.get("parameters", {}) for record in _records_of_scan(stage))
