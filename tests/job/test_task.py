@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, UsdBrdfError
 from usdbrdf.job import arithmetic as arithmetic_module
 from usdbrdf.job import stamp as stamp_module
 from usdbrdf.job import task as task_module
@@ -76,6 +77,58 @@ def test_damaged_stamp_is_an_absent_one(asset, toy, hashes, damage):
     assert result.reran
     assert result.reason == "not done before"
     assert hashes(asset) == before
+
+
+@pytest.mark.fault("R7")
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"outputs": ["layers/toy.usda"]},
+        {"outputs": {"layers/toy.usda": 5}},
+        {"inputs": "x"},
+        {"parameters": [1]},
+        {"summary": 3},
+        {"once": {"edits.usda": 1}},
+        {"once": [5]},
+        {"earlier": {"layers/toy.usda": "ab"}},
+        {"stage": None},
+    ],
+)
+def test_a_stamp_of_other_types_is_an_absent_one(asset, toy, hashes, changes):
+    """Whoever alters it can reckon its hash."""
+    before, path = hashes(asset), asset / STAMP
+    record = json.loads(path.read_text()) | changes
+    told = {key: value for key, value in record.items() if key not in ("schema", "check")}
+    path.write_text(json.dumps(record | {"check": stamp_module._sha256_of_json(told)}))
+    assert stamp_module.known_hashes(asset / ".usdbrdf") == {}
+    assert toy.run_toy(asset).reason == "not done before"
+    assert hashes(asset) == before
+
+
+@pytest.mark.fault("R9")
+@pytest.mark.parametrize("name", ["textures/box1.lit.exr", "layers/toy.usda", STAMP, "textures"])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_folder_in_the_place_of_a_file_stops_nothing_half_way(
+    tmp_path, asset, toy, hashes, name, known
+):
+    """Nor does a file in the place of a folder; when it is gone the same command ends the work."""
+    before = hashes(asset)
+    folder = asset if known else tmp_path / "new"
+    if not known:
+        toy.run_toy(folder)  # the folder is ours, and knows no file
+        shutil.rmtree(folder / "textures")
+        (folder / STAMP).unlink()
+    place = folder / name
+    if place.is_dir():
+        shutil.rmtree(place)
+    place.unlink(missing_ok=True)
+    place.write_text("x") if name == "textures" else place.mkdir(parents=True)
+    with pytest.raises(OwnershipConflict, match=f"{place}: this is .*ownership.place"):
+        toy.run_toy(folder)
+    assert not list(folder.glob(".usdbrdf/publishing-*"))
+    place.unlink() if place.is_file() else place.rmdir()
+    assert toy.run_toy(folder).reran
+    assert hashes(folder) == before
 
 
 @pytest.mark.fault("R8")

@@ -40,6 +40,7 @@ def calls(folder, other, out):
         "package": ["package", str(folder), "-o", str(out / "room.usdz")],
         "whole": ["package", str(folder), "-o", str(out / "room.usdz"), "--whole"],
         "publish": ["publish", str(folder), str(out / "versions")],
+        "relight": ["relight", str(folder), "-o", str(out / "lit.exr")],
         "validate": ["validate", str(folder)],
     }
 
@@ -161,3 +162,41 @@ def test_damage_to_where_the_photographs_are_is_a_finding(strange, capsys, conte
     (strange / "layers/photographs.usdc").write_bytes(content)
     assert main(["validate", str(strange)]) == 0
     assert "photographs.usdc@ cannot be read" in capsys.readouterr().out
+
+
+@pytest.mark.fault("R7")
+@pytest.mark.parametrize("content", [b"", b"PXR-USDC", b"no layer at all"])
+@pytest.mark.parametrize(
+    ("name", "layer"),
+    [
+        ("texture", "layers/photographs.usdc"),
+        ("relight", "layers/photographs.usdc"),
+        ("fit", "layers/lights.usda"),
+    ],
+)
+def test_a_layer_that_cannot_be_read_is_named(
+    converted, strange, tmp_path, capfd, name, layer, content
+):
+    """And not the stage that a step makes of all of them."""
+    (strange / layer).write_bytes(content)
+    assert main(calls(strange, converted.folder, tmp_path)[name]) == 3
+    said = capfd.readouterr().err
+    assert f"{strange / layer}: this is not a readable USD layer" in said
+    assert "anon:" not in said
+
+
+@pytest.mark.fault("R7")
+@pytest.mark.parametrize("layer", ["layers/contents.usda", "room.usda", COMPONENT])
+@pytest.mark.parametrize("name", ["texture", "shade", "fit"])
+def test_a_step_in_an_asset_that_lost_a_layer_is_refused_before_its_work(
+    base, converted, tmp_path, capfd, layer, name, request
+):
+    folder = base / f"lost-{abs(hash(request.node.name))}" / "room"
+    shutil.copytree(converted.folder, folder)
+    (folder / layer).unlink()
+    before = bytes_of(folder)
+    call = calls(folder, converted.folder, tmp_path)[name]
+    assert main([*call, "--seed", "9"] if name != "texture" else call) == 3
+    assert f"{folder / layer}: this layer of the asset is missing" in capfd.readouterr().err
+    assert bytes_of(folder) == before
+    shutil.rmtree(folder.parent)

@@ -29,7 +29,8 @@ def directives_of(asset: Asset, stage: Usd.Stage, words: Sequence[str]) -> dict[
     Raises InputRefused where review.usda cannot be read or asks what nobody can do.
     """
     stamp = read_stamp(stamp_path(asset.folder, 1, "ingest"))
-    asked: dict[str, str] = dict(stamp.summary.get("directives", {})) if stamp else {}
+    told = stamp.summary.get("directives") if stamp else None
+    asked: dict[str, str] = dict(told) if isinstance(told, dict) else {}
     for path, said in read_review(asset).items():
         if said.fault:
             raise InputRefused(

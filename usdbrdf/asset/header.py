@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, UsdGeom, Vt
 
-from usdbrdf.asset.layout import Asset, open_metadata
+from usdbrdf.asset.layout import Asset, open_metadata, record_of
 from usdbrdf.asset.properties import SCHEMA_VERSION
 from usdbrdf.asset.schemas import verify
 from usdbrdf.errors import OwnershipConflict
@@ -84,7 +84,7 @@ def read_provenance(layer: Path) -> dict[str, Any]:
     """``customLayerData.usdbrdf`` of a layer file; empty where it has none, or there is none."""
     if not layer.is_file():
         return {}
-    return dict(open_metadata(layer).customLayerData.get("usdbrdf", {}))
+    return record_of(open_metadata(layer))
 
 
 def capture_up_of(asset: Asset) -> str:

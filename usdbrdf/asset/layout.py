@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import posixpath
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from pxr import Sdf, Tf
 
@@ -19,6 +21,8 @@ ROLES = ("scan", "texturing", "shading", "material")
 # What the tasks write into, but for files of the folder itself; and how many names a path to any of
 # these files has, that of the asset among them: NAME/objects/OBJECT/OBJECT.usda.
 _OWN_FOLDERS, _DEEPEST = ("layers", "objects", "textures", "previews"), 4
+# What a layer's record says in tables of its own.
+_TABLES = ("parameters", "inputs", "competing_bindings")
 # The variant set that chooses among several lightings of a scene.
 LIGHTING = "lighting"
 
@@ -97,8 +101,11 @@ class Asset:
         if not scan.is_file():
             return None
         with suppress(InputRefused):
-            record = open_metadata(scan).customLayerData.get("usdbrdf", {})
-            return tuple(record.get("lightings", ()))
+            names = record_of(open_metadata(scan)).get("lightings", ())
+            told = not isinstance(names, str) and isinstance(names, Iterable)
+            # They are parts of paths that steps write to.
+            if told and all(isinstance(n, str) and Sdf.Path.IsValidIdentifier(n) for n in names):
+                return tuple(names)
         return None
 
     @property
@@ -275,3 +282,11 @@ def open_metadata(layer: Path) -> Sdf.Layer:
     if not opened:
         raise refused
     return opened
+
+
+def record_of(layer: Sdf.Layer) -> dict[str, Any]:
+    """``customLayerData.usdbrdf`` of a layer; empty where it has none, without what is no table
+    where one is to be: others may have written it."""
+    record = layer.customLayerData.get("usdbrdf", {})
+    said = record if isinstance(record, dict) else {}
+    return {k: v for k, v in said.items() if k not in _TABLES or isinstance(v, dict)}

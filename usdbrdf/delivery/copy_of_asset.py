@@ -14,7 +14,7 @@ from pxr import Sdf
 
 from usdbrdf.asset.layers.lights_layer import LIGHTS
 from usdbrdf.asset.layers.looks import VARIANT_SET as LOOKS
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import Asset, record_of
 from usdbrdf.asset.readers.compose import open_edited
 from usdbrdf.delivery.collection import (
     Collection,
@@ -84,8 +84,12 @@ def write_copy(
 
     def edit(layer: Sdf.Layer, is_root: bool) -> bool:
         changed = space != WORKING_SPACE and convert_layer(layer, textures, space)
+<<<<<<< HEAD
         changed |= _forget_places(layer)
         if layer.customLayerData.get("usdbrdf", {}).get("role") == "edits":
+=======
+        if record_of(layer).get("role") == "edits":
+>>>>>>> faults-12
             layer.documentation = "What the artist's layer said when this copy was made."
             changed = True
         if is_root:

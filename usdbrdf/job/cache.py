@@ -42,7 +42,7 @@ def keep(asset: Path, name: str, record: Mapping[str, Any], arrays: Mapping[str,
 def kept(asset: Path, name: str) -> tuple[dict[str, Any], dict[str, Array]] | None:
     """Record and arrays as they were kept; None where there are none, or none intact."""
     for path in sorted((asset / STATE_FOLDER / "cache").glob(f"{name}.*.npz")):
-        with suppress(OSError, InputRefused, KeyError, ValueError):
+        with suppress(OSError, InputRefused, KeyError, TypeError, ValueError):
             if sha256_of(path) == path.name.split(".")[-2]:
                 arrays = load_arrays(path)
                 return dict(json.loads(arrays.pop(_RECORD).tobytes())), arrays

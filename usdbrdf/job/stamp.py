@@ -115,11 +115,26 @@ def read_stamp(path: Path) -> Stamp | None:
         if record.pop("schema") != STAMP_SCHEMA or record.pop("check") != _sha256_of_json(record):
             return None
         stamp = Stamp(**record)
+        if not _is_of_its_types(stamp):
+            return None
         for relative in (*stamp.outputs, *stamp.once, *stamp.earlier):
             check_relative(relative)
     except (InputRefused, UsdBrdfError, AttributeError, KeyError, TypeError):
         return None
     return stamp
+
+
+def _is_of_its_types(stamp: Stamp) -> bool:
+    """Whether its values are what ``Stamp`` says: anybody can reckon the hash of a record."""
+    texts = stamp.stage, stamp.version, stamp.code, *stamp.once
+    tables = stamp.parameters, stamp.inputs, stamp.outputs, stamp.summary, stamp.earlier
+    if not (isinstance(stamp.once, list) and all(isinstance(table, dict) for table in tables)):
+        return False
+    texts += *stamp.inputs.values(), *stamp.outputs.values()
+    lists = stamp.earlier.values()
+    return all(isinstance(text, str) for text in texts) and all(
+        isinstance(each, list) and all(isinstance(text, str) for text in each) for each in lists
+    )
 
 
 def write_stamp(path: Path, stamp: Stamp) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header, refuse_old_layout
 from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.readers.compose import refuse_missing
 from usdbrdf.job.progress import say, warn
 from usdbrdf.job.stamp import code_version, name_in_lighting
 from usdbrdf.job.task import TaskResult, TaskRun, run_task
@@ -58,12 +59,15 @@ class Task:
 
     def run(self, work: Callable[[TaskRun], dict[str, Any]], workers: Workers = HERE) -> TaskResult:
         """Do the work unless it is done already (see ``usdbrdf.job.task``); OwnershipConflict in an
-        asset of an old layout."""
+        asset of an old layout, InputRefused in one that has lost a layer."""
         refuse_old_layout(self.asset)
+        order = 1 + ROLES.index(self.role)
+        if order > 1:
+            refuse_missing(self.asset, order)
         return run_task(
             self.asset.folder,
             name_in_lighting(self.name, self.asset.lighting),
-            order=1 + ROLES.index(self.role),
+            order=order,
             parameters=self.parameters,
             inputs=self.inputs,
             work=work,

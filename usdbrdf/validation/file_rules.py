@@ -12,6 +12,7 @@ from pathlib import Path
 
 from pxr import Ar, Sdf, Tf, Usd
 
+from usdbrdf.asset.layout import record_of
 from usdbrdf.asset.manifest import changes
 from usdbrdf.asset.properties import SCHEMA_VERSION
 from usdbrdf.asset.readers.compose import named_files
@@ -23,7 +24,7 @@ from usdbrdf.files.images import read_exr
 from usdbrdf.files.published_images import misnamed
 from usdbrdf.job.ownership import edited_files
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
-from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, located, record_of, rule
+from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, located, rule
 
 _HEADER = ("metersPerUnit", "upAxis", "timeCodesPerSecond")
 _UDIM = "<UDIM>"

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from pxr import Ar, Sdf, Usd, UsdShade
 
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layers.looks import VARIANT_SET
-from usdbrdf.asset.layout import ROLES, Asset
+from usdbrdf.asset.layout import ROLES, Asset, record_of
 from usdbrdf.asset.readers.compose import named_files, with_variant
 from usdbrdf.asset.readers.scene import authored
 
@@ -255,12 +255,6 @@ def _with_sublayers(layer: Sdf.Layer | None, loaded: Mapping[str, Sdf.Layer]) ->
         return []
     below = (loaded.get(str(located(layer, path))) for path in layer.subLayerPaths)
     return [layer, *(each for sub in below for each in _with_sublayers(sub, loaded))]
-
-
-def record_of(layer: Sdf.Layer) -> dict[str, Any]:
-    """``customLayerData.usdbrdf`` of a layer; empty where it has none."""
-    record = layer.customLayerData.get("usdbrdf", {})
-    return record if isinstance(record, dict) else {}
 
 
 def located(layer: Sdf.Layer, asset_path: str) -> Path:

@@ -12,7 +12,7 @@ from typing import Any
 from pxr import Sdf, Tf, Usd, UsdUtils
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header, read_provenance
-from usdbrdf.asset.layout import LIGHTING, ROLES, Asset
+from usdbrdf.asset.layout import LIGHTING, ROLES, Asset, open_metadata
 from usdbrdf.asset.manifest import refuse_converted
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.tried import (
@@ -67,6 +67,7 @@ def open_edited(asset: Asset) -> Usd.Stage:
     try_in_child(asset.root_layer, beside=beside)
     stage = open_stage(asset.root_layer)
     for file in beside:
+        open_metadata(file)  # which names it
         stage.GetSessionLayer().subLayerPaths.append(str(file))
     return _in_lighting(stage, asset)
 
@@ -217,6 +218,10 @@ def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
     uv = None if asset.lighting else asset.uv_layer
     named = [*(layer for layer in reversed(layers) if layer != uv), *_beneath(asset)]
     try_layers(named, together=True)
+    below = {asset.layer("texturing"): asset.uv_layer, asset.layer("shading"): asset.lights_layer}
+    for layer in (*named, *(part for whole, part in below.items() if whole in layers)):
+        if layer.is_file():
+            open_metadata(layer)  # which names it, where USD would name the stage made here
     root.subLayerPaths = [*map(str, named)]
     return open_stage(root)
 
@@ -273,6 +278,21 @@ def outdated_steps(asset: Asset) -> list[str]:
             if layer.parent == folder and layer.is_file() and sha256_of(layer) != sha256:
                 found.append(f"{stamp.stage} was made with another {name}")  # type: ignore[union-attr]
     return found
+
+
+def refuse_missing(asset: Asset, order: int) -> None:
+    """InputRefused where the root layer is gone, or one that a step before the one of this order
+    wrote: the asset would not open, whatever is measured."""
+    stamps = sorted((asset.folder / STATE_FOLDER / "stamps").glob("*.json"))
+    before = [read_stamp(path) for path in stamps if path.name.split("-")[0] < str(order)]
+    written = {name for stamp in before if stamp for name in stamp.outputs}
+    layers = [asset.root_layer, *(asset.folder / name for name in sorted(written))]
+    for layer in layers:
+        if layer.suffix.startswith(".usd") and not layer.is_file():
+            raise InputRefused(
+                f"{layer}: this layer of the asset is missing. Run `usdbrdf convert`, or the step "
+                "that writes it, again. [asset.incomplete]"
+            )
 
 
 def steps_to_come(asset: Asset) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from usdbrdf.asset.layout import LIGHTING
+from usdbrdf.asset.layout import LIGHTING, record_of
 from usdbrdf.asset.properties import (
     AOV,
     CAPTURE,
@@ -29,6 +29,7 @@ from usdbrdf.asset.properties import (
     ShadedObject,
     facts_of,
 )
+from usdbrdf.asset.readers.foreign import place_of, refuses_foreign
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.model.arrays import Float, Int
@@ -52,11 +53,13 @@ _IMAGE, _EXPOSURE = CAPTURE.attribute("image"), CAPTURE.attribute("exposureTime"
 _PINHOLE = CAPTURE.attribute(CAPTURE.key)
 
 
+@refuses_foreign("the lighting")
 def lighting_of_stage(stage: Usd.Stage) -> str:
     """The lighting that is selected; "" where there is but one."""
     return str(stage.GetDefaultPrim().GetVariantSet(LIGHTING).GetVariantSelection())
 
 
+@refuses_foreign("the photographs")
 def frames_from_stage(stage: Usd.Stage) -> Frames:
     """The photographs, with poses in metres and absolute image paths, in the order of time."""
     camera = capture_camera(stage)
@@ -110,6 +113,7 @@ def frames_from_stage(stage: Usd.Stage) -> Frames:
     )
 
 
+@refuses_foreign("the photographs")
 def hashes_of_photographs(stage: Usd.Stage) -> list[str]:
     """The SHA-256 of each frame's photograph, and of its mask behind a space, as ingest read them,
     in the order of time; "" where nothing tells."""
@@ -125,7 +129,7 @@ def capture_camera(stage: Usd.Stage) -> UsdGeom.Camera:
         if prim.IsA(UsdGeom.Camera) and authored(prim, _PINHOLE) is not None:
             return UsdGeom.Camera(prim)
     raise InputRefused(
-        f"{stage.GetRootLayer().identifier}: no camera of the stage has taken photographs "
+        f"{place_of(stage)}: no camera of the stage has taken photographs "
         "(usdBrdf:capture:pinhole). Run ingest again. [stage.camera]"
     )
 
@@ -142,7 +146,7 @@ def asset_file(attribute: Usd.Attribute, time: Usd.TimeCode | float) -> Path | N
 
 def _records_of_scan(stage: Usd.Stage) -> list[dict[str, Any]]:
     """What the scan layers of a stage say of how they were made."""
-    used = [layer.customLayerData.get("usdbrdf", {}) for layer in stage.GetUsedLayers()]
+    used = map(record_of, stage.GetUsedLayers())
     return [record for record in used if record.get("role") == "scan"]
 
 
@@ -151,13 +155,14 @@ def capture_up_of_stage(stage: Usd.Stage) -> str:
     return next((str(r["capture_up"]) for r in _records_of_scan(stage) if "capture_up" in r), "")
 
 
+@refuses_foreign("the meshes")
 def scene_from_stage(stage: Usd.Stage) -> Scene:
     """All objects, in the order of traversal: meshes with usdBrdf:label, in the world, in metres.
     Meshes without normals of their own get them by the crease angle that ingest was given."""
     prims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh) and is_measured(p, OBJECT)]
     if not prims:
         raise InputRefused(
-            f"{stage.GetRootLayer().identifier}: no mesh of the stage has a usdBrdf:label. "
+            f"{place_of(stage)}: no mesh of the stage has a usdBrdf:label. "
             "Run `usdbrdf ingest` again. [stage.objects]"
         )
     given = (record.get("parameters", {}) for record in _records_of_scan(stage))
@@ -223,6 +228,7 @@ def _read_mesh(
     return points, triangles, in_world, uv
 
 
+@refuses_foreign("the meshes")
 def given_corner_uv(stage: Usd.Stage, prim_path: str) -> Float | None:
     """(T, 3, 2) texture coordinates that an input file's mesh came with, for the corners of the
     object's triangles as ``scene_from_stage`` orders them; None where it has none to use."""
@@ -292,12 +298,14 @@ def is_measured(prim: Usd.Prim, schema: Schema) -> bool:
     return authored(prim, schema.attribute(schema.key)) is not None
 
 
+@refuses_foreign("the maps")
 def aov_path(stage: Usd.Stage, prim_path: str, aov: str) -> Path | None:
     """Absolute path of an object's map; None where the object has no such map."""
     attribute = stage.GetPrimAtPath(prim_path).GetAttribute(AOV.attribute("file", aov))
     return asset_file(attribute, Usd.TimeCode.Default()) if attribute else None
 
 
+@refuses_foreign("the maps")
 def read_aovs(stage: Usd.Stage, prim_path: str) -> tuple[Aov, ...]:
     """All maps of an object, by name; from whatever layers the stage is composed of."""
     prim = stage.GetPrimAtPath(prim_path)
@@ -317,6 +325,7 @@ def read_object(
     return read_record(kind, prim, prim_path=prim_path, identifier=identifier, **others)
 
 
+@refuses_foreign("the light from outside")
 def light_from_outside(stage: Usd.Stage) -> tuple[LightFromOutside, Path] | None:
     """What shading said of the light from outside, and the absolute path of its picture; None where
     it found none."""
@@ -327,6 +336,7 @@ def light_from_outside(stage: Usd.Stage) -> tuple[LightFromOutside, Path] | None
     return (read_record(LightFromOutside, prim), file) if file else None
 
 
+@refuses_foreign("the textures")
 def read_unwrapped(stage: Usd.Stage, prim_path: str) -> tuple[tuple[int, int], float]:
     """Width and height of an object's textures, and the side of a texel in metres; InputRefused
     where it was not unwrapped yet."""
@@ -344,6 +354,7 @@ read_shading = partial(read_object, ShadedObject, SHADING)
 read_fit = partial(read_object, FittedObject, FIT)
 
 
+@refuses_foreign("the objects")
 def read_record(kind: type[Record], prim: Usd.Prim, instance: str = "", **others: Any) -> Record:
     """A record as ``author_record`` said it; ``others`` are its fields that are no facts."""
     fields, row_type = dict(others), cast(type, kind)

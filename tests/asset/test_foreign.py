@@ -1,0 +1,140 @@
+"""Layers that somebody else wrote: values of another type are refused in a sentence."""
+
+from __future__ import annotations
+
+import pytest
+from pxr import Gf, Sdf, Vt
+
+from usdbrdf.asset.header import read_provenance
+from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.scene import (
+    frames_from_stage,
+    hashes_of_photographs,
+    read_aovs,
+    read_fit,
+    read_shading,
+    read_unwrapped,
+    scene_from_stage,
+)
+from usdbrdf.errors import InputRefused, UsageError
+
+TYPES = Sdf.ValueTypeNames
+OTHERS = {
+    "gone": (None, None),
+    "text": (TYPES.String, "x"),
+    "number": (TYPES.Int, -1),
+    "numbers": (TYPES.IntArray, Vt.IntArray([5, 7, 9])),
+    "path": (TYPES.Asset, Sdf.AssetPath("../../../x")),
+    "vector": (TYPES.Float3, Gf.Vec3f(float("nan"))),
+}
+ATTRIBUTES = {
+    "scan": (
+        "points", "faceVertexCounts", "faceVertexIndices", "normals", "xformOp:transform",
+        "usdBrdf:label", "usdBrdf:capture:exposureTime", "usdBrdf:capture:pinhole",
+        "usdBrdf:capture:resolution", "usdBrdf:capture:noiseFloorRadiance",
+    ),
+    "texturing_uv": ("primvars:st",),
+    "texturing": ("usdBrdf:texturing:resolution", "usdBrdf:aov:lit:file", "usdBrdf:aov:lit:scale"),
+    "shading": ("usdBrdf:shading:raysPerTexel", "usdBrdf:aov:irradiance:unit"),
+    "material": ("usdBrdf:fit:status", "usdBrdf:fit:phi"),
+}  # fmt: skip
+CASES = [(role, name) for role, names in ATTRIBUTES.items() for name in names]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory, synthetic):
+    folder = tmp_path_factory.mktemp("foreign")
+    return synthetic.build(folder / "room", synthetic.make_scan(folder / "capture")).asset
+
+
+def file_of(asset, role):
+    return asset.uv_layer if role == "texturing_uv" else asset.layer(role)
+
+
+def look(asset):
+    """All that a step or a report asks the stage for; how many refused."""
+    stage, refused = open_measured(asset), []
+
+    def objects():
+        for one in scene_from_stage(stage).objects:
+            for read in (read_shading, read_fit, read_aovs, read_unwrapped):
+                read(stage, one.prim_path)
+
+    def photographs():
+        frames_from_stage(stage)
+        hashes_of_photographs(stage)
+
+    for ask in (objects, photographs):
+        try:
+            ask()
+        except InputRefused as error:
+            refused.append(str(error))
+    return refused
+
+
+@pytest.mark.fault("S8")
+@pytest.mark.parametrize(("role", "name"), CASES)
+def test_a_value_of_another_type_is_refused_or_passed_over(room, role, name):
+    file = file_of(room, role)
+    sound = file.read_bytes()
+    changed = 0
+    try:
+        for kind, value in OTHERS.values():
+            layer = Sdf.Layer.OpenAsAnonymous(str(file))
+            places = []
+            layer.Traverse(
+                Sdf.Path.absoluteRootPath,
+                lambda path, found=places: path.name == name and found.append(path),
+            )
+            for place in places:
+                spec = layer.GetAttributeAtPath(place)
+                if spec is None:
+                    continue
+                prim, times = spec.owner, layer.ListTimeSamplesForPath(place)
+                prim.RemoveProperty(spec)
+                changed += 1
+                if kind is None:
+                    continue
+                spec = Sdf.AttributeSpec(prim, name, kind)
+                for time in times:
+                    layer.SetTimeSample(place, time, value)
+                if not times:
+                    spec.default = value
+            layer.Export(str(file))
+            for sentence in look(room):
+                assert "[" in sentence
+                assert "\n" not in sentence
+    finally:
+        file.write_bytes(sound)
+    assert changed
+    assert not look(room)
+
+
+@pytest.mark.fault("S8")
+@pytest.mark.parametrize(
+    "record",
+    [
+        "x",
+        5,
+        {"parameters": "x", "inputs": 3, "lightings": 7},
+        {"lightings": Vt.StringArray(["../../x", "b"])},
+        {"lightings": Vt.StringArray(["a/b"])},
+        {"lightings": "ab"},
+    ],
+)
+def test_a_record_of_another_kind_says_nothing(room, record):
+    """Names of lightings are parts of paths that steps write to."""
+    file = room.layer("scan")
+    sound = file.read_bytes()
+    layer = Sdf.Layer.OpenAsAnonymous(str(file))
+    layer.customLayerData = {"usdbrdf": record}
+    try:
+        layer.Export(str(file))
+        assert room.lightings == ()
+        with pytest.raises(UsageError):
+            room.in_lighting("../../x")
+        told = read_provenance(file)
+        assert all(isinstance(told.get(key, {}), dict) for key in ("parameters", "inputs"))
+        assert not look(room)
+    finally:
+        file.write_bytes(sound)

@@ -1,0 +1,50 @@
+"""What an asset's layers say may have been written by anybody: any prim may be missing, and any
+attribute of ours may have a value of another type, or none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+from pxr import Usd
+
+from usdbrdf.errors import InputRefused
+from usdbrdf.untrusted.usd_paths import words_of
+
+P = ParamSpec("P")
+R = TypeVar("R")
+_MAX_LENGTH = 200
+# What is raised by who goes on with such a value, by USD's own functions among them.
+_STUMBLES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+
+
+def refuses_foreign(what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A function that reads ``what`` in one of its arguments, a stage or a prim, and finds it, or
+    says in a sentence (InputRefused) that it is not what we would have written there."""
+
+    def of_reader(reader: Callable[P, R]) -> Callable[P, R]:
+        @wraps(reader)
+        def read(*given: P.args, **named: P.kwargs) -> R:
+            try:
+                return reader(*given, **named)
+            except _STUMBLES as error:
+                said = " ".join(words_of(error).split())[:_MAX_LENGTH]
+                raise InputRefused(
+                    f"{place_of(*given)}: what the layers say of {what} is not what usdbrdf writes "
+                    f"there ({type(error).__name__}: {said}). Take the layers from a copy of the "
+                    "asset, or run `usdbrdf convert` again with --discard. [stage.content]"
+                ) from error
+
+        return read
+
+    return of_reader
+
+
+def place_of(*given: Any) -> str:
+    """The file by which a stage, or that of a prim, the first of ``given``, is to be named."""
+    place = next(each for each in given if isinstance(each, Usd.Stage | Usd.Prim))
+    layer = (place.GetStage() if isinstance(place, Usd.Prim) else place).GetRootLayer()
+    # Of a stage that we put together, the strongest of its layers.
+    below = [*layer.subLayerPaths] if layer.anonymous else []
+    return str((below or [layer.identifier])[0])
