@@ -84,12 +84,8 @@ def write_copy(
 
     def edit(layer: Sdf.Layer, is_root: bool) -> bool:
         changed = space != WORKING_SPACE and convert_layer(layer, textures, space)
-<<<<<<< HEAD
         changed |= _forget_places(layer)
-        if layer.customLayerData.get("usdbrdf", {}).get("role") == "edits":
-=======
         if record_of(layer).get("role") == "edits":
->>>>>>> faults-12
             layer.documentation = "What the artist's layer said when this copy was made."
             changed = True
         if is_root:
