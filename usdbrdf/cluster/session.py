@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from usdbrdf.cluster.options import ClusterOptions, is_url
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.progress import say
 from usdbrdf.job.units import HERE, Unit, Workers
 from usdbrdf.model.arrays import Array
@@ -136,8 +137,11 @@ def _local_cluster(count: int) -> Iterator[Any]:
     from dask import config
 
     given = {"NUMBA_NUM_THREADS": threads}
-    with config.set(_PATIENT):
-        cluster = _started(count, given)
+    with ExitStack() as stack:
+        stack.enter_context(config.set(_PATIENT))
+        # Of one of its own Dask would leave the locks behind.
+        scratch = config.get("temporary-directory") or stack.enter_context(scratch_folder())
+        cluster = _started(count, given, str(scratch))
         try:
             say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
             yield cluster
@@ -157,7 +161,7 @@ def _end(cluster: Any) -> None:
             os.kill(pid, signal.SIGKILL)
 
 
-def _started(count: int, environment: Mapping[str, str]) -> Any:
+def _started(count: int, environment: Mapping[str, str], scratch: str) -> Any:
     """A LocalCluster. A worker that dies while it starts is no reason to give up."""
     from dask import config
     from distributed import LocalCluster, Security
@@ -174,6 +178,7 @@ def _started(count: int, environment: Mapping[str, str]) -> Any:
                     silence_logs=logging.CRITICAL,
                     # Pages of mapped files would count, which the system may take back.
                     memory_limit=0,
+                    local_directory=scratch,
                     env=environment,
                     preload=[_DEAF],
                 )
