@@ -157,9 +157,11 @@ def _local_cluster(count: int) -> Iterator[Any]:
     given = {"NUMBA_NUM_THREADS": threads}
     with ExitStack() as stack:
         stack.enter_context(config.set(_PATIENT))
-        # Of one of its own Dask would leave the locks behind.
-        scratch = config.get("temporary-directory") or stack.enter_context(scratch_folder())
-        cluster = _started(count, given, str(scratch))
+        if not config.get("temporary-directory", None):
+            # Dask would leave its locks behind, and what workers had that were killed last.
+            scratch = str(stack.enter_context(scratch_folder()))
+            stack.enter_context(config.set({"temporary-directory": scratch}))
+        cluster = _started(count, given)
         try:
             say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
             yield cluster
@@ -179,7 +181,7 @@ def _end(cluster: Any) -> None:
             os.kill(pid, signal.SIGKILL)
 
 
-def _started(count: int, environment: Mapping[str, str], scratch: str) -> Any:
+def _started(count: int, environment: Mapping[str, str]) -> Any:
     """A LocalCluster. A worker that dies while it starts is no reason to give up."""
     from dask import config
     from distributed import LocalCluster, Security
@@ -196,7 +198,6 @@ def _started(count: int, environment: Mapping[str, str], scratch: str) -> Any:
                     silence_logs=logging.CRITICAL,
                     # Pages of mapped files would count, which the system may take back.
                     memory_limit=0,
-                    local_directory=scratch,
                     env=environment,
                     preload=[_DEAF],
                 )
