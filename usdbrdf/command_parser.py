@@ -54,6 +54,7 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
         raise UsageError(f"{name}: expected a command. See usdbrdf --help. [usage.command]")
     said, given = _said(commands[name]), {}
     valued = [x.option for x in said if x.field.kind is not bool and not x.option.placed]
+    words = _without_empty(words, {name for o in valued if o.empty for name in o.names})
     _refuse_empty(words, {name for option in valued for name in option.names})
     # Nothing that was or must be said needs a parser, which takes time to load.
     if words or any(item.field.default is REQUIRED for item in said):
@@ -70,6 +71,17 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
             raise UsageError(f"{sentence} See usdbrdf {name} --help. [usage.option]") from error
     command: Command = _made(commands[name], given)
     return command
+
+
+def _without_empty(words: Sequence[str], optional: Set[str]) -> list[str]:
+    """The words without those ``optional`` options whose value is empty."""
+    left: list[str] = []
+    for word in words:
+        if not word and left and left[-1] in optional:
+            left.pop()
+        elif not (word.endswith("=") and word[:-1] in optional):
+            left.append(word)
+    return left
 
 
 def _refuse_empty(words: Sequence[str], with_value: Set[str]) -> None:

@@ -80,7 +80,7 @@ class _InBundle(Talking):
 class FarmWork(OnCapture, Locking, _InBundle):
     """Convert, validate and report scans of a bundle, as its tasks do."""
 
-    root: Path | None = option("--root DIR", None, unset="as when the list was written")
+    root: Path | None = option("--root DIR", None, unset="as when the list was written", empty=True)
     "folder above all scans"
     chosen: str | None = option("--scans RANGE", None, unset="all")
     "their numbers in the list, such as 3 or 1-5,8"

@@ -29,6 +29,7 @@ class Option(NamedTuple):
     counts: tuple[int, ...] = ()  # how many numbers make up a value
     file: bool = False  # a file must lie there before any work begins
     none: str = ""  # the word for None on the command line
+    empty: bool = False  # an empty word is None, as a job gives it whose parameter has no value
     words: tuple[str, ...] = ()  # that may stand in the place of a file
     url: bool = False  # a text with :// in it may stand in the place of a path, and stays one
     joined: bool = False  # given again it says more: the texts become one, with commas between

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -225,35 +227,72 @@ def test_without_workers_a_run_ends_though_all_is_sent(
         ended.set()
 
 
+def scheduler_that(answers: Callable[[], Any]) -> Any:
+    """A client of one."""
+    asked = SimpleNamespace(address="tcp://head:8786", ncores=None, processing=None)
+    return SimpleNamespace(scheduler=asked, sync=lambda question, callback_timeout: answers())
+
+
 @pytest.mark.parametrize("takes_s", [0.0, 1.0])
 def test_waiting_for_workers_ends_however_long_starting_some_takes(
     takes_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To Dask a time of 0 s is no limit."""
     from usdbrdf.cluster import engine
 
     monkeypatch.setattr(engine, "_NO_WORKERS", 0.5)
-    waited = []
-
-    def wait_for_workers(count: int, timeout: float) -> None:
-        waited.append(timeout)
-        if len(waited) > 20:
-            raise AssertionError
-        time.sleep(timeout)
-        raise TimeoutError
-
-    def nobody() -> dict[str, int]:
-        return {}
-
-    client = SimpleNamespace(
-        scheduler=SimpleNamespace(address="inproc://none"),
-        nthreads=nobody,
-        wait_for_workers=wait_for_workers,
-    )
-    workers = engine.DaskWorkers(client, None, 60.0, lambda: time.sleep(takes_s))  # type: ignore[arg-type]
+    client = scheduler_that(dict)
+    workers = engine.DaskWorkers(client, None, 60.0, lambda: time.sleep(takes_s))
     with pytest.raises(EnvironmentFailure, match=r"no worker came.*\[cluster.workers\]"):
         workers.elsewhere()
-    assert all(timeout > 0 for timeout in waited)
+
+
+@pytest.mark.parametrize(
+    ("failure", "told"),
+    [
+        (OSError, "the scheduler is gone"),
+        (asyncio.CancelledError, "the scheduler is gone"),
+        # As one that is stopped: the system keeps its connections.
+        (TimeoutError, "has not answered for 300 s"),
+        (asyncio.TimeoutError, "has not answered for 300 s"),
+    ],
+)
+def test_a_scheduler_that_ends_or_stops_while_workers_are_waited_for_is_no_lack_of_workers(
+    failure: type[BaseException], told: str
+) -> None:
+    from usdbrdf.cluster import engine
+
+    answers = iter([{}, {}])
+
+    def answer() -> dict[str, int]:
+        for known in answers:
+            return known
+        raise failure
+
+    workers = engine.DaskWorkers(scheduler_that(answer), None, 60.0)
+    with pytest.raises(EnvironmentFailure, match=rf"{told}.*\[cluster.scheduler\]"):
+        workers.elsewhere()
+
+
+def test_who_listens_and_says_nothing_is_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as one that is stopped; Dask waits for its first word without end."""
+    from usdbrdf.cluster import session
+
+    monkeypatch.setattr(session, "_ANSWER", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with (
+            workers_of(ClusterOptions(scheduler=address)) as workers,
+            pytest.raises(EnvironmentFailure, match=r"nothing came in 0.5 s.*cluster.scheduler"),
+        ):
+            workers.elsewhere()
+
+
+def test_tls_without_certificates_is_a_sentence() -> None:
+    with (
+        workers_of(ClusterOptions(scheduler="tls://127.0.0.1:8786")) as workers,
+        pytest.raises(EnvironmentFailure, match=r"no scheduler answers \(TLS.*\[cluster.scheduler"),
+    ):
+        workers.elsewhere()
 
 
 def test_a_photograph_that_a_worker_alone_cannot_read_is_told_with_the_worker(

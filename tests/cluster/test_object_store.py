@@ -3,6 +3,7 @@ other's files, and nothing is left."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -229,6 +230,7 @@ def test_a_store_without_credentials_is_a_sentence(server: str, tmp_path: Path) 
         (PermissionError("AccessDenied"), "access is denied here (AccessDenied)"),
         (ConnectionError("reset"), "the object store failed (ConnectionError: reset)"),
         (TimeoutError(), "the object store failed (TimeoutError: )"),
+        (OSError(errno.ENOSPC, "No space left"), "does not fit on a disk ([Errno 28] No space"),
     ],
 )
 def test_what_a_store_refuses_is_a_failure_of_the_environment(

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -261,6 +262,19 @@ def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
     ):
         pass
     assert len(tries) == 3
+
+
+def test_workers_leave_nothing_among_temporary_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dask leaves its locks, and what a worker had that was killed last."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with workers_of(ClusterOptions(workers=1)) as workers:
+        assert isinstance(workers, _Session)
+        assert workers._started().elsewhere() == 1
+        assert [*tmp_path.rglob("worker-*")]
+        os.kill(workers_on_this_machine()[0], signal.SIGKILL)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_workers_are_begun_anew_where_their_nannies_gave_up() -> None:

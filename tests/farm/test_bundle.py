@@ -135,6 +135,17 @@ def test_values_may_begin_with_a_dash(tmp_path):
     assert (command.adapter, command.wait_s, command.without_lock) == ("-mine", 90, True)
 
 
+@pytest.mark.parametrize("root", [["--root", ""], ["--root="]])
+def test_without_a_folder_above_all_scans_the_list_tells_it(root):
+    """What OpenJD makes of the parameter's default, in the command that ``usdbrdf farm`` tells."""
+    from usdbrdf.command_parser import parsed
+
+    command = parsed(["farm-work", "scans.json", *root, "--scans", "1"], COMMANDS)
+    assert (command.root, command.chosen) == (None, "1")
+    with pytest.raises(UsageError, match="--scans: the word given here is empty"):
+        parsed(["farm-work", "scans.json", "--scans", ""], COMMANDS)
+
+
 def test_what_is_told_can_be_pasted_into_a_shell(tmp_path, capsys):
     scan, mesh = folders(tmp_path, "a")[0], tmp_path / "the mesh; x.ply"
     mesh.touch()

@@ -35,8 +35,10 @@ T = TypeVar("T")
 # name comes from a worker; in which one says what it does; and in which one that hangs is to be
 # gone.
 _LOOK, _NO_WORKERS, _NAME, _SAYING, _STOPPING = 1.0, 120.0, 60.0, 5.0, 30.0
-# Seconds between tries to have workers where there are none.
-_ANEW = 5.0
+# Where there are no workers, seconds between looks for them, and between tries to have some.
+_COMING, _ANEW = 0.2, 5.0
+# Seconds in which a scheduler answers: one that is stopped stays connected, and says nothing.
+_SILENCE = 300.0
 # How often a unit may fail with its worker, or for what a machine lacks, until that is believed.
 _TRIES = 5
 # What calls of a client raise where time runs out, and where the scheduler is gone.
@@ -145,18 +147,18 @@ class DaskWorkers:
 
     def _at_once(self) -> int:
         """How many units can be worked on; waits for workers if there are none."""
-        end = time.monotonic() + _NO_WORKERS
-        while not (threads := self._asked(self._client.nthreads)):
-            self._renew()
-            left = end - time.monotonic()
-            if left <= 0:
-                raise self._no_workers()
-            try:
-                self._client.wait_for_workers(1, timeout=min(left, _ANEW))
-            except _LATE:
-                continue
-            except _GONE as error:
-                raise self._no_workers() from error
+        end, anew = time.monotonic() + _NO_WORKERS, 0.0
+        while not (threads := self._told(self._client.scheduler.ncores)):
+            if time.monotonic() >= anew:
+                self._renew()
+                anew = time.monotonic() + _ANEW
+            if time.monotonic() >= end:
+                raise EnvironmentFailure(
+                    f"{self._address}: no worker came in {_NO_WORKERS:.0f} s. Start some for this "
+                    "scheduler, then run the same command again; finished work is kept. "
+                    "[cluster.workers]"
+                )
+            time.sleep(_COMING)
         return sum(threads.values())
 
     def _name(self, future: Future, files: Files) -> str:
@@ -203,7 +205,7 @@ class DaskWorkers:
             raise self._gone()
         self._at_once()
         self._renew()
-        found = self._asked(self._client.processing)
+        found = self._told(self._client.scheduler.processing)
         ours = {future.key: sent for future, sent in out.items()}
         now, before = time.monotonic(), self._at_work
         self._at_work = {}
@@ -265,18 +267,27 @@ class DaskWorkers:
                 )
             )
 
-    def _no_workers(self) -> EnvironmentFailure:
-        return EnvironmentFailure(
-            f"{self._address}: no worker came in {_NO_WORKERS:.0f} s. Start some for this "
-            "scheduler, then run the same command again; finished work is kept. "
-            "[cluster.workers]"
-        )
-
     def _gone(self) -> EnvironmentFailure:
         return EnvironmentFailure(
             f"{self._address}: the scheduler is gone. Start it, then run the same command again; "
             "finished work is kept. [cluster.scheduler]"
         )
+
+    def _told(self, question: Callable[..., Any]) -> Any:
+        """What the scheduler answers; EnvironmentFailure where it is not there, or does not."""
+        client = self._client
+
+        def answer() -> Any:
+            try:
+                return client.sync(question, callback_timeout=_SILENCE)
+            except _LATE as error:
+                raise EnvironmentFailure(
+                    f"{self._address}: the scheduler has not answered for {_SILENCE:g} s. See "
+                    "whether it is stopped, or its machine overloaded, then run the same command "
+                    "again; finished work is kept. [cluster.scheduler]"
+                ) from error
+
+        return self._asked(answer)
 
     def _asked(self, call: Callable[[], T]) -> T:
         """What a call of the client gives; EnvironmentFailure where there is no scheduler."""

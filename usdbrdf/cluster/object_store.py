@@ -8,6 +8,7 @@ that they open.
 
 from __future__ import annotations
 
+import errno
 import re
 import secrets
 import shutil
@@ -189,6 +190,12 @@ class Objects(Files):
                 f"{self.address}: access is denied here ({error}). Let this process and all "
                 "workers have credentials that may read, write, list and delete there. "
                 "[cluster.objects]"
+            )
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return EnvironmentFailure(
+                f"{self.address}: what lies there does not fit on a disk ({error}). Free space "
+                "where copies of it are, in Dask's folder of the worker (--local-directory), then "
+                "run the same command again; finished work is kept. [cluster.objects]"
             )
         return EnvironmentFailure(
             f"{self.address}: the object store failed ({kind}: {error}). See whether this machine "

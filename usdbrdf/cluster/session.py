@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from importlib.util import find_spec
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from usdbrdf.cluster.options import ClusterOptions, is_url
 from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.progress import say
 from usdbrdf.job.units import HERE, Unit, Workers
 from usdbrdf.model.arrays import Array
@@ -113,12 +115,14 @@ def _client(options: ClusterOptions) -> Iterator[Client]:
             client = Client(stack.enter_context(_local_cluster(options.workers or 1)))
         else:
             try:
+                _hear(options.scheduler)
                 client = Client(options.scheduler, timeout=_ANSWER)
-            except (OSError, ValueError) as error:
+            except (OSError, ValueError, TypeError, ImportError, *_LATE) as error:
+                why = str(error) or f"nothing came in {_ANSWER:g} s"
                 raise EnvironmentFailure(
-                    f"--scheduler {options.scheduler}: no scheduler answers ({error}). Check the "
-                    "address, and for tls:// the certificates in Dask's configuration. "
-                    "[cluster.scheduler]"
+                    f"--scheduler {options.scheduler}: no scheduler answers ({why}). Check the "
+                    "address, whether it runs, and for tls:// the certificates in Dask's "
+                    "configuration. [cluster.scheduler]"
                 ) from error
         try:
             _say_dashboard(client)
@@ -126,6 +130,21 @@ def _client(options: ClusterOptions) -> Iterator[Client]:
         finally:
             with suppress(*_LATE):
                 client.close(timeout=_ANSWER)
+
+
+def _hear(address: str) -> None:
+    """Raise what a client would, and TimeoutError where someone listens who says nothing, such as
+    a scheduler that is stopped: for its first word a client waits without end."""
+    from distributed import Security
+    from distributed.comm import connect
+
+    async def hear() -> None:
+        given = Security().get_connection_args("client")
+        comm = await asyncio.wait_for(connect(address, timeout=_ANSWER, **given), _ANSWER)
+        comm.abort()
+
+    with ThreadPoolExecutor(1) as aside:  # a notebook's thread has a loop already
+        aside.submit(lambda: asyncio.run(hear())).result()
 
 
 @contextmanager
@@ -136,7 +155,12 @@ def _local_cluster(count: int) -> Iterator[Any]:
     from dask import config
 
     given = {"NUMBA_NUM_THREADS": threads}
-    with config.set(_PATIENT):
+    with ExitStack() as stack:
+        stack.enter_context(config.set(_PATIENT))
+        if not config.get("temporary-directory", None):
+            # Dask would leave its locks behind, and what workers had that were killed last.
+            scratch = str(stack.enter_context(scratch_folder()))
+            stack.enter_context(config.set({"temporary-directory": scratch}))
         cluster = _started(count, given)
         try:
             say(f"cluster: {count} workers on this machine, each with {threads} of its cores")
