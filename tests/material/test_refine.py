@@ -245,9 +245,9 @@ def test_the_fit_brings_both_maps_nearer_to_the_truth(room: Room, fitted: Asset)
             continue
         assert own.sum() > 20
         wanted = room.clean.map("lit")[own]
-        # What shows no highlight gives up a lobe that remains likely, not quite the true one; of
-        # the box too few samples are left for a fit.
-        most = 1.0 if item.label == "box" else 0.65
+        # Of the box too few samples are left for a fit, and six frames do not tell a lobe as wide
+        # and weak as the ceiling's from none.
+        most = 0.3 if item.label in ("floor", "walls") else 1.0
         assert _off(atlas.map("diffuse")[own], wanted) < most * _off(atlas.map("lit")[own], wanted)
     wanted = np.pi * room.clean.map("lit")[which] / _true_irradiance(room.clean, which)
     found, before = (
