@@ -255,18 +255,18 @@ def tagged_encoding(
     they say none of the same kind. InputRefused where they say several."""
     display = kind_of_encoding(usual) == "display"
     first_of: dict[str, Path] = {}
-    unknown: dict[str, str] = {}
+    unknown: dict[Path, str] = {}
     for record in records:
         with suppress(ImageRefused):  # of which the reader of its pixels will tell
             name, places = colour_tag(record.image_path)
             tag = encoding_of_tag(name, places)
             if tag is None and (name and display):
-                unknown.setdefault(record.image_path.name, f"colour space is {name!r}")
+                unknown.setdefault(record.image_path, f"colour space is {name!r}")
             elif tag is None and places:
                 said = ", ".join(f"{place:.4g}" for place in places)
-                unknown.setdefault(record.image_path.name, f"primaries and white are {said}")
+                unknown.setdefault(record.image_path, f"primaries and white are {said}")
             elif tag is not None and display and kind_of_encoding(tag) == "linear":
-                unknown.setdefault(record.image_path.name, f"values are linear ({tag})")
+                unknown.setdefault(record.image_path, f"values are linear ({tag})")
             alike = tag is not None and (kind_of_encoding(tag) == "display") == display
             first_of.setdefault(tag if tag and alike else usual, record.image_path)
     if len(first_of) > 1:
@@ -279,9 +279,9 @@ def tagged_encoding(
     if unknown:
         image, said = next(iter(unknown.items()))
         findings.warn(
-            f"{source.name}: {len(unknown)} images say that their {said}, first {image!r}, which "
-            f"is not read here: they pass for {usual}. Convert them, or state --input-space. "
-            "[capture.encoding]"
+            f"{source.name}: of {len(unknown)} images, first {image.name!r}, the header says that "
+            f"their {said}, which is not read here: they pass for {usual}. Convert them, or state "
+            "--input-space. [capture.encoding]"
         )
     tag = next(iter(first_of), usual)
     if tag != usual:
