@@ -113,9 +113,9 @@ def write_copy(
 def _forget_places(layer: Sdf.Layer) -> bool:
     """Take out where the capture lay, which the work folder is run again from: a copy has no way
     there, and names of folders are nobody else's. Returns whether anything said it."""
-    about = layer.customLayerData
-    if "places" not in about.get("usdbrdf", {}).get("parameters", {}):
+    if "places" not in record_of(layer).get("parameters", {}):
         return False
+    about = layer.customLayerData
     del about["usdbrdf"]["parameters"]["places"]
     layer.customLayerData = about
     return True
