@@ -87,6 +87,36 @@ def test_images_of_several_colour_spaces_are_refused(capture):
     assert own.frames.encoding == "lin_ap1_scene"
 
 
+def _as_photographs(capture, suffix, said, called=""):
+    """All frames as 8-bit images whose headers say this, by their numbers."""
+    with edited(capture.folder / "transforms.json") as document:
+        for i, frame in enumerate(document["frames"]):
+            pixels = np.clip(read_radiance(capture.image(i)), 0, 1)
+            frame["file_path"] = f"frames/photograph_{i}{called or suffix}"
+            file = capture.folder / f"frames/photograph_{i}{suffix}"
+            spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
+            for name, value in said(i).items():
+                spec.attribute(name, value)
+            output = oiio.ImageOutput.create(str(file))
+            assert output.open(str(file), spec)
+            assert output.write_image(pixels)
+            assert output.close()
+            file.rename(capture.folder / frame["file_path"])
+
+
+def test_the_gamma_that_programs_write_into_png_for_srgb_is_no_other_space(capture):
+    gamma = {"oiio:ColorSpace": "g22_rec709_scene"}
+    _as_photographs(capture, ".png", lambda i: gamma if i % 2 else {})
+    scan = read_scan(capture.folder, IngestOptions(assume_srgb=True))
+    assert scan.frames.encoding == "srgb_rec709_scene"
+
+
+def test_a_photograph_of_another_name_is_called_what_it_is(capture):
+    _as_photographs(capture, ".jpg", lambda i: {}, called=".exr")
+    with pytest.raises(InputRefused, match=r"photograph_0.exr: 12 frames are JPEG, which"):
+        read_scan(capture.folder, IngestOptions())
+
+
 def _as_radiance_hdr(capture, lines):
     """All frames again as Radiance's files, each with its lines of a header."""
     with edited(capture.folder / "transforms.json") as document:

@@ -14,14 +14,14 @@ import numpy as np
 
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
-from usdbrdf.files.colour import encoding_of_tag, kind_of_encoding
+from usdbrdf.files.colour import DISPLAY_SPACE, encoding_of_tag, kind_of_encoding
 from usdbrdf.files.frames import FramePixels, read_frame, read_frames
 from usdbrdf.files.images import (
     colour_tag,
     holds_whole_numbers,
     image_size,
     is_eight_bit,
-    is_jpeg_or_png,
+    name_of_format,
     orientation_of,
     white_of_mask,
 )
@@ -221,22 +221,20 @@ def refuse_photographs(
             "Use images of one kind; radiance beside a JPEG is taken for it. [capture.ldr]"
         )
     if not assume_srgb:
-        kind = photographs[0].suffix[1:].upper()
         unless = " as whole numbers, unless --input-space says that they are linear or logarithms"
         raise InputRefused(
-            f"{photographs[0]}: {len(photographs)} frames are {kind}, which does not hold radiance"
-            f"{unless * _may_be_radiance(photographs[0])}. Export scene-linear EXR, or "
-            "accept a result that is not radiometric with --assume-srgb. [capture.ldr]"
+            f"{photographs[0]}: {len(photographs)} frames are {name_of_format(photographs[0])}, "
+            f"which does not hold radiance{unless * _may_be_radiance(photographs[0])}. Export "
+            "scene-linear EXR, or accept a result that is not radiometric with --assume-srgb. "
+            "[capture.ldr]"
         )
     return True
 
 
 def _is_photograph(path: Path) -> bool:
     """By its name or, as telephones call JPEGs .HEIC and people anything .exr, by what it is."""
-    with suppress(ImageRefused):  # of which the reader of its pixels will tell
-        named = path.suffix.lower() in PHOTOGRAPH_SUFFIXES
-        return named or is_jpeg_or_png(path) or _may_be_radiance(path)
-    return False
+    named = path.suffix.lower() in PHOTOGRAPH_SUFFIXES
+    return named or name_of_format(path) in ("JPEG", "PNG") or _may_be_radiance(path)
 
 
 def _may_be_radiance(path: Path) -> bool:
@@ -269,6 +267,8 @@ def tagged_encoding(
                 unknown.setdefault(record.image_path, f"values are linear ({tag})")
             alike = tag is not None and (kind_of_encoding(tag) == "display") == display
             first_of.setdefault(tag if tag and alike else usual, record.image_path)
+    if first_of.keys() == {DISPLAY_SPACE, "g22_rec709_scene"}:  # as many programs tag sRGB in PNG
+        del first_of["g22_rec709_scene"]
     if len(first_of) > 1:
         (one, first), (other, second), *_ = first_of.items()
         raise InputRefused(
