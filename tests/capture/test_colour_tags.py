@@ -13,8 +13,8 @@ from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import encoding_of_tag
-from usdbrdf.files.frames import PHOTOGRAPH_SATURATION, read_frame
-from usdbrdf.files.images import read_radiance
+from usdbrdf.files.frames import PHOTOGRAPH_SATURATION, read_frame, read_recorded
+from usdbrdf.files.images import colour_tag, read_radiance
 from usdbrdf.options import IngestOptions
 
 # The Academy's AP1 primaries and white, S-2014-004; and from them to linear Rec.709, its white
@@ -72,7 +72,7 @@ def test_a_header_that_says_nothing_known_changes_nothing_and_that_is_told(captu
     scan = read_scan(capture.folder, IngestOptions())
     assert scan.frames.encoding == "lin_rec709_scene"
     (told,) = [sentence for sentence in scan.warnings if "[capture.encoding]" in sentence]
-    assert "12 images say that their primaries and white are 0.6, 0.3, 0.3" in told
+    assert "of 12 images, first '0000.exr', the header says that their primaries" in told
 
 
 def test_images_of_several_colour_spaces_are_refused(capture):
@@ -85,6 +85,36 @@ def test_images_of_several_colour_spaces_are_refused(capture):
         read_scan(capture.folder, IngestOptions())
     own = read_scan(capture.folder, IngestOptions(encoding="lin_ap1_scene"))
     assert own.frames.encoding == "lin_ap1_scene"
+
+
+def _as_photographs(capture, suffix, said, called=""):
+    """All frames as 8-bit images whose headers say this, by their numbers."""
+    with edited(capture.folder / "transforms.json") as document:
+        for i, frame in enumerate(document["frames"]):
+            pixels = np.clip(read_radiance(capture.image(i)), 0, 1)
+            frame["file_path"] = f"frames/photograph_{i}{called or suffix}"
+            file = capture.folder / f"frames/photograph_{i}{suffix}"
+            spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
+            for name, value in said(i).items():
+                spec.attribute(name, value)
+            output = oiio.ImageOutput.create(str(file))
+            assert output.open(str(file), spec)
+            assert output.write_image(pixels)
+            assert output.close()
+            file.rename(capture.folder / frame["file_path"])
+
+
+def test_the_gamma_that_programs_write_into_png_for_srgb_is_no_other_space(capture):
+    gamma = {"oiio:ColorSpace": "g22_rec709_scene"}
+    _as_photographs(capture, ".png", lambda i: gamma if i % 2 else {})
+    scan = read_scan(capture.folder, IngestOptions(assume_srgb=True))
+    assert scan.frames.encoding == "srgb_rec709_scene"
+
+
+def test_a_photograph_of_another_name_is_called_what_it_is(capture):
+    _as_photographs(capture, ".jpg", lambda i: {}, called=".exr")
+    with pytest.raises(InputRefused, match=r"photograph_0.exr: 12 frames are JPEG, which"):
+        read_scan(capture.folder, IngestOptions())
 
 
 def _as_radiance_hdr(capture, lines):
@@ -115,6 +145,28 @@ def test_the_primaries_of_a_radiance_file_are_known(capture):
     said = b"PRIMARIES=.68 .32 .265 .69 .15 .06 .3127 .329"
     _as_radiance_hdr(capture, lambda i: said)
     assert read_scan(capture.folder, IngestOptions()).frames.encoding == "lin_p3d65_scene"
+
+
+def test_a_radiance_file_may_be_of_any_program(tmp_path):
+    """Photoshop writes zeros for primaries that it does not tell."""
+    (file := tmp_path / "a.hdr").write_bytes(
+        b"#?AUTOPANO\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\nPRIMARIES=0 0 0 0 0 0 0 0\n\n"
+        b"-Y 8 +X 8\n" + b"\x80\x80\x80\x81" * 64
+    )
+    assert np.allclose(read_recorded(file, "lin_rec709_scene", np.inf).radiance, 0.5)
+    assert colour_tag(file) == ("lin_rec709_scene", ())
+
+
+def test_images_of_one_name_in_several_folders_are_several(capture):
+    _tag(capture, chromaticities=(0.6, 0.3, 0.3, 0.5, 0.1, 0.1, 0.3, 0.3))
+    with edited(capture.folder / "transforms.json") as document:
+        for i, frame in enumerate(document["frames"]):
+            frame["file_path"] = f"frames/camera_{i}/a.exr"
+            (capture.folder / frame["file_path"]).parent.mkdir()
+            capture.image(i).rename(capture.folder / frame["file_path"])
+    scan = read_scan(capture.folder, IngestOptions())
+    (told,) = [sentence for sentence in scan.warnings if "[capture.encoding]" in sentence]
+    assert "of 12 images" in told
 
 
 def _profile(name: str) -> np.ndarray:

@@ -26,6 +26,9 @@ _ISO = "Exif:PhotographicSensitivity"
         # 0/0 and 1/0, as of lenses without contacts and of programs.
         ({"ExposureTime": math.nan, "FNumber": math.nan, _ISO: 0}, (None, None, None)),
         ({"ExposureTime": math.inf, "FNumber": 0.0}, (None, None, None)),
+        ({"ExposureTime": 0.01, "FNumber": 0.0, "Exif:ApertureValue": 0.0}, (0.01, None, None)),
+        ({"ExposureTime": 0.0, "Exif:ShutterSpeedValue": 0.0}, (None, None, None)),
+        ({"Exif:ShutterSpeedValue": 0.0}, (1.0, None, None)),
         # Beyond two bytes, the other tags alone, and several values.
         ({_ISO: 65535, "Exif:RecommendedExposureIndex": 102400}, (None, None, 102400)),
         ({"Exif:StandardOutputSensitivity": 400}, (None, None, 400)),

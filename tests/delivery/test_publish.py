@@ -98,6 +98,18 @@ def test_no_version_says_where_the_capture_lay(room, tmp_path):
             assert said_by(version / "layers/photographs.usdc") == {"adapter": "usd"}
 
 
+def test_a_layer_of_the_edits_with_a_record_of_another_kind_is_published(room, tmp_path):
+    layer = Sdf.Layer.CreateNew(str(room.asset.folder / "shot.usda"))
+    layer.customLayerData = {"usdbrdf": "reviewed"}
+    assert layer.Save()
+    edits = Sdf.Layer.FindOrOpen(str(room.asset.edits_layer))
+    edits.subLayerPaths.append("./shot.usda")
+    edits.Save()
+    version = Path(publish(room.asset.folder, tmp_path / "dest")["publish"])
+    (copy,) = version.rglob("shot.usda")
+    assert Sdf.Layer.OpenAsAnonymous(str(copy)).customLayerData == {"usdbrdf": "reviewed"}
+
+
 def test_versions_follow_each_other_and_never_change(room, tmp_path):
     dest, folder = tmp_path / "new" / "dest", room.asset.folder
     publish(folder, dest)

@@ -14,14 +14,14 @@ import numpy as np
 
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
-from usdbrdf.files.colour import encoding_of_tag, kind_of_encoding
+from usdbrdf.files.colour import DISPLAY_SPACE, encoding_of_tag, kind_of_encoding
 from usdbrdf.files.frames import FramePixels, read_frame, read_frames
 from usdbrdf.files.images import (
     colour_tag,
     holds_whole_numbers,
     image_size,
     is_eight_bit,
-    is_jpeg_or_png,
+    name_of_format,
     orientation_of,
     white_of_mask,
 )
@@ -221,22 +221,20 @@ def refuse_photographs(
             "Use images of one kind; radiance beside a JPEG is taken for it. [capture.ldr]"
         )
     if not assume_srgb:
-        kind = photographs[0].suffix[1:].upper()
         unless = " as whole numbers, unless --input-space says that they are linear or logarithms"
         raise InputRefused(
-            f"{photographs[0]}: {len(photographs)} frames are {kind}, which does not hold radiance"
-            f"{unless * _may_be_radiance(photographs[0])}. Export scene-linear EXR, or "
-            "accept a result that is not radiometric with --assume-srgb. [capture.ldr]"
+            f"{photographs[0]}: {len(photographs)} frames are {name_of_format(photographs[0])}, "
+            f"which does not hold radiance{unless * _may_be_radiance(photographs[0])}. Export "
+            "scene-linear EXR, or accept a result that is not radiometric with --assume-srgb. "
+            "[capture.ldr]"
         )
     return True
 
 
 def _is_photograph(path: Path) -> bool:
     """By its name or, as telephones call JPEGs .HEIC and people anything .exr, by what it is."""
-    with suppress(ImageRefused):  # of which the reader of its pixels will tell
-        named = path.suffix.lower() in PHOTOGRAPH_SUFFIXES
-        return named or is_jpeg_or_png(path) or _may_be_radiance(path)
-    return False
+    named = path.suffix.lower() in PHOTOGRAPH_SUFFIXES
+    return named or name_of_format(path) in ("JPEG", "PNG") or _may_be_radiance(path)
 
 
 def _may_be_radiance(path: Path) -> bool:
@@ -255,20 +253,22 @@ def tagged_encoding(
     they say none of the same kind. InputRefused where they say several."""
     display = kind_of_encoding(usual) == "display"
     first_of: dict[str, Path] = {}
-    unknown: dict[str, str] = {}
+    unknown: dict[Path, str] = {}
     for record in records:
         with suppress(ImageRefused):  # of which the reader of its pixels will tell
             name, places = colour_tag(record.image_path)
             tag = encoding_of_tag(name, places)
             if tag is None and (name and display):
-                unknown.setdefault(record.image_path.name, f"colour space is {name!r}")
+                unknown.setdefault(record.image_path, f"colour space is {name!r}")
             elif tag is None and places:
                 said = ", ".join(f"{place:.4g}" for place in places)
-                unknown.setdefault(record.image_path.name, f"primaries and white are {said}")
+                unknown.setdefault(record.image_path, f"primaries and white are {said}")
             elif tag is not None and display and kind_of_encoding(tag) == "linear":
-                unknown.setdefault(record.image_path.name, f"values are linear ({tag})")
+                unknown.setdefault(record.image_path, f"values are linear ({tag})")
             alike = tag is not None and (kind_of_encoding(tag) == "display") == display
             first_of.setdefault(tag if tag and alike else usual, record.image_path)
+    if first_of.keys() == {DISPLAY_SPACE, "g22_rec709_scene"}:  # as many programs tag sRGB in PNG
+        del first_of["g22_rec709_scene"]
     if len(first_of) > 1:
         (one, first), (other, second), *_ = first_of.items()
         raise InputRefused(
@@ -279,9 +279,9 @@ def tagged_encoding(
     if unknown:
         image, said = next(iter(unknown.items()))
         findings.warn(
-            f"{source.name}: {len(unknown)} images say that their {said}, first {image!r}, which "
-            f"is not read here: they pass for {usual}. Convert them, or state --input-space. "
-            "[capture.encoding]"
+            f"{source.name}: of {len(unknown)} images, first {image.name!r}, the header says that "
+            f"their {said}, which is not read here: they pass for {usual}. Convert them, or state "
+            "--input-space. [capture.encoding]"
         )
     tag = next(iter(first_of), usual)
     if tag != usual:

@@ -48,12 +48,14 @@ def exif_settings(path: Path) -> Settings:
     speed in stops says so, that is taken, as a whole, half or third stop."""
     said = dict(zip(_NAMES, header_of(path, _NAMES), strict=True))
     time, stops = _positive(said[_TIME]), _finite(said[_STOPS])
+    if said[_TIME] is not None and time is None and stops == 0:
+        stops = None  # of who writes 0 for what is not known
     if time is not None and stops is not None:
         time = _shutter_time(time, stops)
     elif stops is not None:
         time = _power(-stops)
     number, aperture = _positive(said[_NUMBER]), _finite(said[_APERTURE])
-    if number is None and aperture is not None:
+    if number is None and aperture:  # 0 is of lenses without contacts: of f/1 both are written
         number = _power(aperture / 2)
     speeds = [_positive(_first(said[name])) for name in _SPEEDS]
     known = [speed for speed in speeds if speed is not None and speed != _LARGEST_SPEED]

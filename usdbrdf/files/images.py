@@ -175,9 +175,13 @@ def stored_space(path: Path) -> tuple[str, int]:
     return str(spec.getattribute("oiio:ColorSpace") or ""), int(spec.nchannels)
 
 
-def is_jpeg_or_png(path: Path) -> bool:
-    """Whether the image is one of these, whatever its name says, from the header alone."""
-    return open_image(path).format_name() in ("jpeg", "png")
+def name_of_format(path: Path) -> str:
+    """JPEG, PNG, TIFF, OPENEXR and so on, whatever the file is called, from the header alone; its
+    suffix where it cannot be read."""
+    try:
+        return str(open_image(path).format_name()).upper()
+    except ImageRefused:
+        return path.suffix[1:].upper()
 
 
 def is_eight_bit(path: Path) -> bool:

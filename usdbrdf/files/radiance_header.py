@@ -12,7 +12,7 @@ from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
 
 _LONGEST = 1 << 16  # bytes of a header
-_MARKS = (b"#?RADIANCE", b"#?RGBE")
+_MARK = b"#?"  # and the name of the program, which may be any
 _LINE = re.compile(rb"^(EXPOSURE|COLORCORR|PRIMARIES)=(.*)$", re.MULTILINE)
 
 
@@ -27,16 +27,16 @@ def factors_of_hdr(path: Path) -> Double:
 
 
 def primaries_of_hdr(path: Path) -> tuple[float, ...]:
-    """x, y of red, green, blue and white; () where they are not stated."""
+    """x, y of red, green, blue and white; () where they are not stated, as by Photoshop's zeros."""
     stated = [numbers for key, numbers in _stated(path) if key == b"PRIMARIES"]
-    sound = stated and len(stated[-1]) == 8
+    sound = stated and len(stated[-1]) == 8 and stated[-1].any()
     return tuple(float(number) for number in stated[-1]) if sound else ()
 
 
 def _stated(path: Path) -> list[tuple[bytes, Double]]:
     """Lines of finite numbers, in their order."""
     head = beginning_of(path, _LONGEST)
-    if not head.startswith(_MARKS):
+    if not head.startswith(_MARK):
         return []
     lines = _LINE.findall(head.replace(b"\r", b"").partition(b"\n\n")[0])
     found = []
