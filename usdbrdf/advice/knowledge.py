@@ -221,7 +221,8 @@ def outlook(
     products = known.combination @ contrasts @ known.combination.T
     own = np.maximum(np.diag(products), 0)
     apart = np.maximum(own[:, None] + own[None] - 2 * products, 0)
-    # The fit does not tell costs apart that differ by less than this share.
+    # Such a share of the cost is reckoned as the model's. The fit asks its samples instead, which
+    # there are none of yet; by how much its errors are larger is in ``coarser``.
     posterior = known.width * np.exp(-0.5 * apart / MODEL_DISCREPANCY)
     posterior /= posterior.sum(axis=1, keepdims=True)
     errors = [

@@ -35,9 +35,10 @@ def primaries_of_hdr(path: Path) -> tuple[float, ...]:
 
 def _stated(path: Path) -> list[tuple[bytes, Double]]:
     """Lines of finite numbers, in their order."""
-    head = beginning_of(path, _LONGEST)
-    if not head.startswith(_MARK):
+    # Every frame is asked, each time that it is read, and few are Radiance's.
+    if beginning_of(path, len(_MARK)) != _MARK:
         return []
+    head = beginning_of(path, _LONGEST)
     lines = _LINE.findall(head.replace(b"\r", b"").partition(b"\n\n")[0])
     found = []
     for key, said in lines:

@@ -29,9 +29,8 @@ from usdbrdf.material.refined_means import (
     subsample,
     texels_at_once,
 )
-from usdbrdf.model.arrays import Array, Float
+from usdbrdf.model.arrays import Array, Bool, Float
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.texels import Texels
 from usdbrdf.shading.base_color import Reflection, base_color_of
 from usdbrdf.shading.hidden_light import beside_seen, without_leaks
 from usdbrdf.texturing.footprints import around, restored
@@ -97,6 +96,9 @@ def refined_light(
             for one, told in zip(lightings, shown, strict=True)
         ]
     own = [told.in_own_light for told in shown]
+    besides = [
+        beside_seen(texels, one.before.coverage.observed | one.before.emissive) for one in lightings
+    ]
 
     def reflected(irradiance: Sequence[Float], sent: Sequence[Float]) -> tuple[Float, list[Float]]:
         """Base colour, and what is ``sent`` in each lighting with what is reflected where nobody
@@ -104,7 +106,7 @@ def refined_light(
         found = [_reflection(*each) for each in zip(lightings, shown, irradiance, strict=True)]
         base_color = base_color_of(texels, found)
         return base_color, [
-            _with_hidden(texels, base_color, *each) for each in zip(found, sent, strict=True)
+            _with_hidden(base_color, *each) for each in zip(found, sent, besides, strict=True)
         ]
 
     # A texel lights others by what it sends itself, not by what the pixels around it mix.
@@ -176,10 +178,10 @@ def _reflection(lighting: Lighting, told: _Told, irradiance: Float) -> Reflectio
     )
 
 
-def _with_hidden(texels: Texels, base_color: Float, one: Reflection, sent: Float) -> Float:
-    """What texels send, (T, 3), with what they reflect where no frame looked or all clipped."""
-    hidden = base_color * one.irradiance / np.pi
-    hidden = without_leaks(hidden, sent, beside_seen(texels, one.known | one.emissive))
+def _with_hidden(base_color: Float, one: Reflection, sent: Float, beside: Bool) -> Float:
+    """What texels send, (T, 3), with what they reflect where no frame looked or all clipped;
+    beside (T,): see ``beside_seen``."""
+    hidden = without_leaks(base_color * one.irradiance / np.pi, sent, beside)
     told = one.measured | one.emissive
     return np.where(told[:, None], sent, hidden)
 

@@ -203,6 +203,8 @@ def _means_of(shown: _Shown, piece: tuple[slice, int, list[Array]]) -> Mapping[s
 def texels_at_once(
     lit: LitScene, frames: Frames, memory: float | None, need: BytesPerTexel, *, warns: bool = True
 ) -> list[slice]:
+    """Groups of texels for which ``memory`` (GiB) has room beside the frames, of which each texel
+    needs so many bytes; the smallest there are where it has not, of which ``warns`` tells."""
     try:
         return groups_of_texels(lit.texels, lit.scene, frames, memory, need)
     except EnvironmentFailure as short:  # after all that was done, rather too much than nothing
@@ -212,7 +214,8 @@ def texels_at_once(
 
 
 def bytes_of_refining(lightings: Sequence[LitScene]) -> BytesPerTexel:
-    """With the light, which lies beside scene and texels; of each lighting its own."""
+    """What ``means_without_lobes`` takes of a texel, with the light, which lies beside scene and
+    texels; of each lighting its own."""
     light = sum(
         lit.radiance.pixels.nbytes + lit.radiance.faces.nbytes + lit.emission.pixels.nbytes
         for lit in lightings

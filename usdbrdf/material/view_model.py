@@ -173,8 +173,6 @@ _FIRST_GUESS, _LEAST = 0.02, 1e-4
 _MOST_EFFECTS = 2500
 _TAIL = calibration.number("errors.student_freedom")
 LEAST_DIFFUSE = calibration.number("errors.least_diffuse")
-
-
 # Parts of space across an object within which errors are taken to hang together.
 _PLACES = calibration.number("errors.places_across")
 
