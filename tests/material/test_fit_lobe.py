@@ -9,14 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from usdbrdf.material.fit_lobe import Candidate, fit_lobe
+from usdbrdf.material.fit_lobe import Candidate, Linear, fit_lobe
 from usdbrdf.material.verdict import NOTHING_KNOWN, SOME_EVIDENCE, LobeEstimate, averaged
-from usdbrdf.material.view_model import ViewSamples
+from usdbrdf.material.view_model import ViewModel, ViewSamples
 
 TEXELS, FRAMES = 50, 10
 SAMPLES = TEXELS * FRAMES
 LIGHT = np.array([1.0, 0.9, 0.8])
 SEEDS = range(20)
+# A roughness and its neighbours.
+PHIS = (0.2, 0.25, 0.32)
 # Relative standard deviations of what frames share: exposure, cells of space, white balance.
 FRAME, CELL, COLOUR, OWN = 0.02, 0.04, 0.01, 0.015
 Basis = Callable[[float], tuple[np.ndarray, np.ndarray]]
@@ -136,6 +138,29 @@ def test_light_that_is_badly_known_widens_the_errors():
     right, wrong = np.median(stated, axis=0)
     assert wrong > 1.5 * right
     assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.5
+
+
+def test_what_a_texel_sends_to_all_views_does_not_change_the_errors():
+    """It is the diffuse part's, which is free: frames do not pull phi and psi by it."""
+    samples, mirrored = _views(1)
+    basis, even = _basis(mirrored), np.linspace(0.2, 1.0, TEXELS, dtype=np.float32)
+
+    def with_even(phi: float) -> tuple[np.ndarray, np.ndarray]:
+        base, slope = basis(phi)
+        return base, slope + even[samples.texel, None]
+
+    model = ViewModel(samples)
+    for _ in range(4):
+        model.update(np.zeros_like(samples.radiance))
+    scatter = []
+    for one in (basis, with_even):
+        base, slope = one(0.25)
+        seen = samples.radiance + base + np.float32(0.5) * slope
+        at = _side_by_side(one)(PHIS)
+        linear = Linear.about(model, seen, (at, at), PHIS, 0.5)
+        scatter.append(linear.scatter(model.groups))
+    np.testing.assert_allclose(scatter[1], scatter[0], rtol=1e-3)
+    assert max(scatter[0]) > 1
 
 
 def test_errors_that_frames_share_are_no_lobe():

@@ -35,7 +35,8 @@ _REPEATS = 4
 class Linear(NamedTuple):
     """The lobe of P samples about what was found, from two bases with independent noise.
 
-    by_first, by_second  (P, 3, 2): its derivatives by phi and psi
+    by_first, by_second  (P, 3, 2): its derivatives by phi and psi, freed of the texels' means: what
+                         a texel sends to all views is diffuse light to the fit, and moves neither
     between              (P, 3): the difference of the two
     solved               (P, 3, 6): C^-1 of the derivatives and of what either leaves of the samples
     precision            (2, 2): H = J1' C^-1 J2, with that of the prior at least
@@ -61,7 +62,9 @@ class Linear(NamedTuple):
         lobes = [base + np.float32(psi) * slope for base, slope in bases]
         step = phis[2] - phis[0]
         first, second = (
-            np.stack([(lobe[..., 2] - lobe[..., 0]) / step, slope[..., 1]], axis=-1)
+            model.reduced(
+                np.stack([(lobe[..., 2] - lobe[..., 0]) / step, slope[..., 1]], axis=-1)
+            ).values
             for lobe, (_, slope) in zip(lobes, bases, strict=True)
         )
         left = [(radiance - lobe[..., 1])[..., None] for lobe in lobes]
