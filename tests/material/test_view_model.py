@@ -220,3 +220,18 @@ def test_what_no_lobe_explains_is_told_beside_what_one_does():
             model.update(lobe)
         alike = np.linalg.norm([true[name] for name in ("frame", "small", "large")])
         assert model.contradiction == pytest.approx(alike / (1 + specular), rel=0.25)
+
+
+def test_places_are_six_across_up_to_the_very_end():
+    along = np.linspace(0, 1, 61, dtype=np.float32)
+    samples = ViewSamples(
+        texel=np.arange(61),
+        frame=np.zeros(61, np.int64),
+        position=np.stack([3 + 0.7 * along, 0 * along, 0 * along], axis=1),
+        radiance=np.ones((61, 3), np.float32),
+        noise=np.ones((61, 3), np.float32),
+        cell=0.1,
+    )
+    count = np.bincount(samples.places)
+    assert len(count) == 6
+    assert count.min() >= 9

@@ -194,7 +194,8 @@ class ViewSamples:
     def places(self) -> Long:
         """(P,): the part of space that each sample lies in, ``_PLACES`` across, counted from 0."""
         place = self.position - self.position.min(axis=0)
-        part = np.floor(place * (_PLACES / max(float(place.max()), 1e-30))).astype(np.int64)
+        part = np.floor(place * (_PLACES / max(float(place.max()), 1e-30)))
+        part = np.minimum(part, _PLACES - 1).astype(np.int64)  # the farthest sample is in the last
         return np.unique(part, axis=0, return_inverse=True)[1].ravel()
 
 
