@@ -263,6 +263,7 @@ ENGINEERING: dict[str, str] = {
     "_KEPT_MAPS": "memory",
     "_LAGS": "pixels at which correlations are taken",
     "_LAMP": "numerics: deviations",
+    "_LAMP_ROUNDS": "steps of a search",
     "_LARGEST": "limit of what is refused",
     "_LARGEST_SHARE": "time: what is done again when a worker dies",
     "_LEAK": "geometry: texels that pixels may mix",

@@ -12,7 +12,9 @@ from tests.physics.surfaces import Sampling, box, quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap, Texels
+from usdbrdf.shading import shaded
 from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light
+from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved
 from usdbrdf.shading.shaded import find_emitters
 from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
@@ -81,6 +83,15 @@ def _photographed(hall, radiance: np.ndarray, index: int):
     return surface, shown, CoverageMap.of(~unseen, np.zeros(len(texels), np.bool_))
 
 
+def _hidden_above(hall, height: float):
+    """The same, of which no frame shows what is higher, and what is known of lamps: nothing."""
+    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
+    seen = coverage.observed & (surface.texels.position[:, 2] < height)
+    lit = np.where(seen[:, None], lit, np.median(lit[seen], axis=0))
+    none = np.zeros(len(seen), np.bool_)
+    return surface, lit, CoverageMap.of(seen, none), KnownLamps(none, {})
+
+
 def test_the_lamp_that_no_frame_shows_is_found_with_its_radiance(hall):
     surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
     found = lamps_that_explain(surface, lit, coverage, FRAMES, DARK, 0)
@@ -102,6 +113,37 @@ def test_the_lamp_that_no_frame_shows_is_found_with_its_radiance(hall):
     np.testing.assert_allclose(emitters.radiance[LAMP], found.radiance[0], rtol=1e-5)
     assert found.error_of(LAMP) == pytest.approx(float(found.error[0]))
     assert np.isnan(found.error_of(SHELF))
+
+
+def test_what_hidden_walls_send_on_of_its_light_is_not_taken_for_its_own(hall, tmp_path: Path):
+    surface, lit, coverage, known = _hidden_above(hall, 2.5)
+    given = surface, lit, coverage, DARK, 0, known
+    first = lamps_that_explain(surface, light_of_hidden(*given), coverage, FRAMES, DARK, 0)
+    run = TaskRun(tmp_path, "shade", tmp_path)
+    with_it, found = shaded._lit_by_unseen_lamps(run, *given, FRAMES, {})
+    assert first.object.tolist() == found.object.tolist() == [LAMP]
+    off, off_at_first = (np.abs(lamps.radiance[0] / RADIANCE - 1).max() for lamps in (found, first))
+    assert off < 0.1
+    assert off < 0.6 * off_at_first
+    np.testing.assert_array_equal(with_it, found.with_light(surface.texels, with_it))
+
+
+def test_a_lamp_that_is_none_in_the_others_light_is_off(hall, tmp_path: Path, monkeypatch):
+    surface, lit, coverage, known = _hidden_above(hall, 2.5)
+    both = UnseenLamps(
+        object=np.array([LAMP, SHELF], np.int32),
+        radiance=np.array([RADIANCE, 100 * RADIANCE], np.float32),
+        error=np.full(2, 0.2, np.float32),
+    )
+    told = iter([both, *2 * [UnseenLamps(**{k: v[:1] for k, v in vars(both).items()})]])
+    monkeypatch.setattr(shaded, "estimate_unseen_lamps", lambda *_: next(told))
+    run = TaskRun(tmp_path, "shade", tmp_path)
+    given = surface, lit, coverage, DARK, 0, known
+    with_it, found = shaded._lit_by_unseen_lamps(run, *given, FRAMES, {})
+    assert found.object.tolist() == [LAMP]
+    assert not list(told)
+    shelf = with_it[surface.texels.of_object(SHELF)]
+    assert (shelf < np.max(lit[~np.isin(surface.texels.object_index(), LAMP)])).all()
 
 
 def test_so_is_one_that_is_as_small_as_it_is_bright():

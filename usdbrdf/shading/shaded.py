@@ -37,6 +37,8 @@ from usdbrdf.transport.surface_texture import SurfaceTexture
 
 _WHOLE_LAMP = calibration.number("emitters.whole_lamp")
 _MIN_PATCH = calibration.count("emitters.min_texels")
+# In the light of lamps found they are asked for again, so many times in all at most.
+_LAMP_ROUNDS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,12 +349,11 @@ def _light(
     told = np.isin(owner, [number for number, is_lamp in said.items() if is_lamp])
     # What clips may be a lamp, or reflect what is not known yet.
     may_shine = told | coverage.clipped | groups.texels_of(groups.lamp)
-    known = KnownLamps(may_shine, said, doubt=doubt)
-    lit = with_hidden_light(run, "hidden", surface, lit, coverage, environment, seed, known)
     # In the light of what it may be that no frame shows.
     shine = said if outside is None else {int(i): True for i in outside.lamps} | dict(said)
-    unseen = estimate_unseen_lamps(run, surface, lit, coverage, frames, environment, seed, shine)
-    lit = unseen.with_light(texels, lit)
+    known = KnownLamps(may_shine, said, doubt=doubt)
+    measured = lit, coverage, environment, seed, known
+    lit, unseen = _lit_by_unseen_lamps(run, surface, *measured, frames, shine)
     light = estimate_clipped_light(run, surface, lit, coverage, frames, environment, seed, said)
     lamps = light.groups.texels_of(light.groups.lamp) | np.isin(owner, unseen.object)
     if (light.lit[lamps] == filled[lamps]).all() and not (may_shine & ~told & ~lamps).any():
@@ -362,6 +363,37 @@ def _light(
     lamplit = np.where((coverage.observed | known.texel)[:, None], light.lit, filled)
     given = lamplit, coverage, environment, seed, known, light.lit
     return replace(light, lit=with_hidden_light(run, "hidden-lit", surface, *given)), unseen
+
+
+def _lit_by_unseen_lamps(
+    run: TaskRun,
+    surface: TexturedScene,
+    filled: Float,
+    coverage: CoverageMap,
+    environment: Environment,
+    seed: int,
+    known: KnownLamps,
+    frames: Frames,
+    shine: Mapping[int, bool],
+) -> tuple[Float, UnseenLamps]:
+    """L_d, ``filled`` (T, 3) where no frame measures it, with the lamps that no frame shows and
+    what hidden surfaces send on. What these send on of one lamp's light looks like another's, so
+    lamps are asked for again in that light, until they remain the same."""
+    owner, lit, unseen = surface.texels.object_index(), filled, UnseenLamps.none()
+    for number in range(_LAMP_ROUNDS):
+        before, shines = unseen.object, np.isin(owner, unseen.object)
+        lamps = known._replace(texel=known.texel | shines)
+        lamplit = np.where((coverage.observed | lamps.texel)[:, None], lit, filled)
+        given = lamplit, coverage, environment, seed, lamps, lit
+        lit = with_hidden_light(run, f"hidden-{number}", surface, *given)
+        asked = lit, coverage, frames, environment, seed, shine
+        unseen = estimate_unseen_lamps(run, f"unseen-{number}", surface, *asked)
+        lit = unseen.with_light(surface.texels, np.where(shines[:, None], filled, lit))
+        if np.array_equal(unseen.object, before):
+            break
+    if len(unseen.object):
+        say(f"shade: {len(unseen.object)} lamps that no frame shows, by the light that they cast")
+    return lit, unseen
 
 
 def shade_surface(

@@ -16,7 +16,6 @@ from types import MappingProxyType
 import numpy as np
 
 from usdbrdf import calibration
-from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float, Int
 from usdbrdf.model.capture import Frames
@@ -75,6 +74,7 @@ class UnseenLamps:
 
 def estimate_unseen_lamps(
     run: TaskRun,
+    name: str,
     surface: TexturedScene,
     lit: Float,
     coverage: CoverageMap,
@@ -83,17 +83,14 @@ def estimate_unseen_lamps(
     seed: int,
     said: Mapping[int, bool] = MappingProxyType({}),
 ) -> UnseenLamps:
-    """Of a scan with the radiance ``lit`` (T, 3), in the ``environment``. said: of objects whether
-    they are lamps, where that is known."""
+    """Of a scan with the radiance ``lit`` (T, 3), in the ``environment``; kept under ``name``.
+    said: of objects whether they are lamps, where that is known."""
 
     def compute() -> dict[str, Array]:
         found = lamps_that_explain(surface, lit, coverage, frames, environment, seed, said)
         return dict(vars(found))
 
-    found = UnseenLamps(**run.checkpoint("unseen", compute))
-    if len(found.object):
-        say(f"shade: {len(found.object)} lamps that no frame shows, by the light that they cast")
-    return found
+    return UnseenLamps(**run.checkpoint(name, compute))
 
 
 def lamps_that_explain(
