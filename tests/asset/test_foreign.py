@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from pxr import Gf, Sdf, Vt
 
@@ -17,6 +19,8 @@ from usdbrdf.asset.readers.scene import (
     scene_from_stage,
 )
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.atomic import sha256_of
+from usdbrdf.job.stamp import stamp_of, stamp_path, write_stamp
 
 TYPES = Sdf.ValueTypeNames
 OTHERS = {
@@ -138,3 +142,31 @@ def test_a_record_of_another_kind_says_nothing(room, record):
         assert not look(room)
     finally:
         file.write_bytes(sound)
+
+
+def test_a_stumble_over_what_we_wrote_ourselves_is_no_fault_of_the_file(room, monkeypatch):
+    """That the layers are not what usdbrdf writes would be untrue, and hide where the defect is."""
+
+    def stumbles(stage):
+        raise KeyError("of ours")
+
+    monkeypatch.setattr("usdbrdf.asset.readers.scene.capture_camera", stumbles)
+    stage = open_measured(room)
+    record = stamp_path(room.folder, 1, "ingest")
+    record.parent.mkdir(parents=True)
+    files = sorted((room.folder / "layers").iterdir())
+    hashes = {file.relative_to(room.folder).as_posix(): sha256_of(file) for file in files}
+    stamp = replace(stamp_of("ingest", {}, {}), outputs=hashes)
+    try:
+        write_stamp(record, stamp)
+        with pytest.raises(KeyError, match="of ours"):
+            frames_from_stage(stage)
+        # One of the bytes is another than the step wrote.
+        scan = room.layer("scan").relative_to(room.folder).as_posix()
+        write_stamp(record, replace(stamp, outputs=hashes | {scan: "0" * 64}))
+        with pytest.raises(InputRefused, match=r"KeyError: 'of ours'.*\[stage.content\]"):
+            frames_from_stage(stage)
+    finally:
+        record.unlink()
+        record.parent.rmdir()
+        (room.folder / ".usdbrdf").rmdir()
