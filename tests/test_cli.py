@@ -750,6 +750,7 @@ def test_what_the_machine_refuses_is_no_defect_wherever_it_comes(
     assert err.endswith("[environment.io]\n")
 
 
+@pytest.mark.fault("R4")
 def test_a_limit_on_processes_is_no_defect(capture, tmp_path):
     """Threads count as processes, and want addresses for their stacks."""
     code = (
