@@ -97,12 +97,7 @@ def test_what_is_measured_of_objects_stays(both):
     assert set(usual) == set(other)
     # Texels of a third of the box: its sides are measured in other places.
     for name in usual:
-        for key, relative in {
-            "area": 0.02,
-            "lit": 0.01,
-            "irradiance": 0.04,
-            "albedo": 0.05,
-        }.items():
+        for key, relative in {"lit": 1e-3, "irradiance": 0.1, "albedo": 0.08}.items():
             np.testing.assert_allclose(
                 other[name][key], usual[name][key], rtol=relative, err_msg=f"{name}: {key}"
             )
