@@ -725,7 +725,16 @@ def test_a_full_disk_behind_stdout(arguments):
     assert (status, err.count("\n")) == (4, 1)
 
 
-@pytest.mark.parametrize("code", [errno.EACCES, errno.EIO, errno.ESTALE, errno.EMFILE])
+CURES = {
+    errno.EACCES: "Free disk",
+    errno.EIO: "Free disk",
+    errno.ESTALE: "Free disk",
+    errno.EMFILE: "Raise this shell's limit on open files",
+    errno.EAGAIN: "Raise the limits on processes",  # of a fork
+}
+
+
+@pytest.mark.parametrize("code", CURES)
 def test_what_the_machine_refuses_is_no_defect_wherever_it_comes(
     capture, tmp_path, monkeypatch, capsys, code
 ):
@@ -737,9 +746,32 @@ def test_what_the_machine_refuses_is_no_defect_wherever_it_comes(
     monkeypatch.setattr(pipeline, "ingest", refused)
     assert main(["ingest", str(capture), "-o", str(tmp_path / "out")]) == 4
     err = capsys.readouterr().err
-    cure = "Raise this shell's limit on open files" if code == errno.EMFILE else "Free disk"
-    assert err.startswith(f"usdbrdf: layers/scan.usdc: {os.strerror(code)}. {cure}")
+    assert err.startswith(f"usdbrdf: layers/scan.usdc: {os.strerror(code)}. {CURES[code]}")
     assert err.endswith("[environment.io]\n")
+
+
+@pytest.mark.fault("R4")
+def test_a_limit_on_processes_is_no_defect(capture, tmp_path):
+    """Threads count as processes, and want addresses for their stacks."""
+    code = (
+        "import sys, threading; from usdbrdf import pipeline\n"
+        "from usdbrdf.cli import main\n"
+        "class Refused(threading.Thread):\n"
+        '    def start(self): raise RuntimeError("can\'t start new thread")\n'
+        "threading.Thread = Refused\n"
+        "sys.exit(main(['ingest', *sys.argv[1:]]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(capture), "-o", str(tmp_path / "out"), "-q"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 4, done.stderr
+    assert re.fullmatch(
+        r"usdbrdf: this machine.*threads.*ulimit -u.* \[environment\.processes\]\n", done.stderr
+    )
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_defect_is_told_from_a_mistake(capture, tmp_path, monkeypatch, capsys):

@@ -56,10 +56,12 @@ def _run(arguments: Sequence[str]) -> int:
         from usdbrdf.files.paths import refuse_lost_folder
         from usdbrdf.job.compiler import refuse_unusable_settings
         from usdbrdf.job.memory import refuse_few_addresses
+        from usdbrdf.job.processes import refuse_few_threads
     refuse_lost_folder()
     command = parsed(arguments, COMMANDS)
     set_quiet(getattr(command, "quiet", False))
     refuse_few_addresses()
+    refuse_few_threads()
     refuse_unusable_settings()
     return command.run()
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 from pxr import Gf, Sdf, Vt
 
 from usdbrdf.asset.header import read_provenance
-from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.compose import open_edited, open_measured, open_stage
 from usdbrdf.asset.readers.scene import (
     frames_from_stage,
     hashes_of_photographs,
@@ -16,7 +22,9 @@ from usdbrdf.asset.readers.scene import (
     read_unwrapped,
     scene_from_stage,
 )
-from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
+from usdbrdf.files.atomic import sha256_of
+from usdbrdf.job.stamp import stamp_of, stamp_path, write_stamp
 
 TYPES = Sdf.ValueTypeNames
 OTHERS = {
@@ -138,3 +146,75 @@ def test_a_record_of_another_kind_says_nothing(room, record):
         assert not look(room)
     finally:
         file.write_bytes(sound)
+
+
+def test_a_stumble_over_what_we_wrote_ourselves_is_no_fault_of_the_file(room, monkeypatch):
+    """That the layers are not what usdbrdf writes would be untrue, and hide where the defect is."""
+
+    def stumbles(stage):
+        raise KeyError("of ours")
+
+    monkeypatch.setattr("usdbrdf.asset.readers.scene.capture_camera", stumbles)
+    stage = open_measured(room)
+    record = stamp_path(room.folder, 1, "ingest")
+    record.parent.mkdir(parents=True)
+    files = sorted((room.folder / "layers").iterdir())
+    hashes = {file.relative_to(room.folder).as_posix(): sha256_of(file) for file in files}
+    stamp = replace(stamp_of("ingest", {}, {}), outputs=hashes)
+    try:
+        write_stamp(record, stamp)
+        with pytest.raises(KeyError, match="of ours"):
+            frames_from_stage(stage)
+        # One of the bytes is another than the step wrote.
+        scan = room.layer("scan").relative_to(room.folder).as_posix()
+        write_stamp(record, replace(stamp, outputs=hashes | {scan: "0" * 64}))
+        with pytest.raises(InputRefused, match=r"KeyError: 'of ours'.*\[stage.content\]"):
+            frames_from_stage(stage)
+    finally:
+        record.unlink()
+        record.parent.rmdir()
+        (room.folder / ".usdbrdf").rmdir()
+
+
+@pytest.mark.parametrize(
+    ("edits", "said"),
+    [
+        (
+            "#usda 1.0\nover {",
+            r"USD cannot read this layer \(.*edits\.usda:2:\d+: .*\)\. Correct it",
+        ),
+        (None, r"this layer, which \S+\.usda names, is missing\. Bring it back"),
+    ],
+)
+def test_a_layer_that_cannot_be_read_is_what_the_sentence_is_about(room, edits, said):
+    """Neither the root layer that names it, nor what USD's parser calls its rules."""
+    sound = room.edits_layer.read_text()
+    try:
+        if edits is None:
+            room.edits_layer.unlink()
+        else:
+            room.edits_layer.write_text(edits)
+        with pytest.raises(
+            InputRefused, match=rf"^{re.escape(str(room.edits_layer))}: {said}"
+        ) as it:
+            open_edited(room)
+        assert "pxrInternal" not in str(it.value)
+    finally:
+        room.edits_layer.write_text(sound)
+
+
+def test_a_layer_that_one_may_not_read_is_no_damage(room, monkeypatch):
+    sound = room.edits_layer.read_text()
+
+    def forbidden(self, *_):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    try:
+        # USD says the same of a layer that it may not read.
+        room.edits_layer.write_text("")
+        monkeypatch.setattr(Path, "open", forbidden)
+        with pytest.raises(EnvironmentFailure, match=r"edits\.usda: Permission denied"):
+            open_stage(room.root_layer)
+    finally:
+        monkeypatch.undo()
+        room.edits_layer.write_text(sound)

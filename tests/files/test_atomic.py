@@ -160,6 +160,25 @@ def test_what_another_process_is_writing_stays(tmp_path):
     assert not unseen.exists()
 
 
+def test_a_folder_that_cannot_be_removed_keeps_nothing_else(tmp_path, monkeypatch):
+    """As one of those that a network disk fills with files which somebody holds open."""
+    left = [tmp_path / f"{named(NOBODY)[:-2]}{k:02x}" for k in range(12)]
+    for place in left[::3]:
+        place.touch()
+    for place in {*left} - {*left[::3]}:
+        place.mkdir()
+    stuck, remove = {left[1].name, left[7].name}, os.rmdir
+
+    def refused(path, **named):
+        if os.path.basename(path) in stuck:
+            raise OSError(errno.EBUSY, os.strerror(errno.EBUSY), path)
+        remove(path, **named)
+
+    monkeypatch.setattr(os, "rmdir", refused)
+    write_text_atomic(tmp_path / "a.txt", "new")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", *stuck}
+
+
 @pytest.mark.fault("R2")
 def test_what_another_process_with_our_number_left_goes_and_ours_stays(tmp_path, monkeypatch):
     """In a container each command is process 1."""

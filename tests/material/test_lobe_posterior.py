@@ -71,6 +71,17 @@ def test_a_lobe_that_explains_nothing_has_no_evidence(without: float):
     assert lobe_from_costs(PHIS, terms, without, 0.0, FREEDOM, 0.0).evidence == 0
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e-2, 1.0])
+def test_evidence_is_a_share_whatever_the_costs_are(unit: float):
+    # A parabola in psi from the cost without a lobe down to a tenth of it, at any roughness.
+    without, psi = 20.0 * unit, 0.6
+    c2 = 0.9 * without / psi**2
+    terms = np.tile([without, psi * c2, c2], (len(PHIS), 1))
+    found = lobe_from_costs(PHIS, terms, without, 0.0, FREEDOM, 0.0)
+    assert found.evidence == pytest.approx(0.9)
+    assert found.cost == pytest.approx(0.1 * without / FREEDOM)
+
+
 def test_a_lobe_narrower_than_its_footprint_is_unresolved():
     widths = []
     for phi in (0.5, 0.1, 0.02):

@@ -20,6 +20,15 @@ _METAL = _DIELECTRIC._replace(
 )
 
 
+def published(fit: ObjectFit, *, microfacet: bool = True):
+    thing = SceneObject(
+        prim_path="/a/b", identifier="b", label="b", class_name="", first_face=0, num_faces=1
+    )
+    maps = SimpleNamespace(scene=SimpleNamespace(objects=[thing]), is_observed=lambda _: True)
+    [found] = fitted_objects([maps], [fit], FitOptions(), {}, microfacet=microfacet)  # type: ignore[list-item]
+    return found
+
+
 @pytest.mark.parametrize(
     ("fit", "microfacet", "lobe"),
     [
@@ -32,11 +41,14 @@ _METAL = _DIELECTRIC._replace(
 def test_the_lobe_that_is_named_is_the_one_that_numbers_are_of(
     fit: ObjectFit, microfacet: bool, lobe: str
 ):
-    thing = SceneObject(
-        prim_path="/a/b", identifier="b", label="b", class_name="", first_face=0, num_faces=1
-    )
-    maps = SimpleNamespace(scene=SimpleNamespace(objects=[thing]), is_observed=lambda _: True)
-    [found] = fitted_objects([maps], [fit], FitOptions(), {}, microfacet=microfacet)  # type: ignore[list-item]
+    found = published(fit, microfacet=microfacet)
     assert found.lobe == lobe
     assert found.status == "measured"
     assert found.is_metal == math.isfinite(fit.clearer)
+
+
+@pytest.mark.parametrize("cost", [-0.0025, 0.0, 1.5])
+def test_rays_that_were_noisier_than_the_samples_leave_no_cost_below_nothing(cost: float):
+    """Else the asset that was just made is found wrong."""
+    assert published(_DIELECTRIC._replace(cost=cost)).cost == max(cost, 0.0)
+    assert math.isnan(published(ObjectFit()).cost)

@@ -119,6 +119,21 @@ def test_what_is_not_known_or_hardly_so_is_left_within_reason():
     assert found.max() <= 4
 
 
+def test_the_unit_of_light_plays_no_part():
+    world = _flat()
+    surface = TexturedScene(world.scene, world.texels, world.rays)
+    light, owner = _light(world), world.texels.object_index()
+    every = np.arange(len(light), dtype=np.int32)
+
+    def found(unit: float) -> np.ndarray:
+        lit = surface.texture((light * np.float32(unit)).astype(np.float32))
+        return beside_own_light(surface, owner, lit, every, _camera())
+
+    assert found(1).std() > 0.3
+    for unit in (2.0**-12, 2.0**12):
+        np.testing.assert_allclose(found(unit), found(1), rtol=1e-4)
+
+
 def test_pictures_are_drawn_in_parts_alike(monkeypatch):
     world = _folded()
     surface = TexturedScene(world.scene, world.texels, world.rays)

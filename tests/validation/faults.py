@@ -241,6 +241,12 @@ def published_picture_changed(built):
     picture.write_bytes(picture.read_bytes() + b"more")
 
 
+def mesh_lost(built):
+    with edited(built.asset.layer("scan")) as layer:
+        spec = layer.GetPrimAtPath(WALL)
+        del spec.nameParent.nameChildren[spec.name]
+
+
 FAULTS = {
     "LayerMissing": edits_layer_deleted,
     "LayerOrder": edits_below_the_measurement,
@@ -257,6 +263,7 @@ FAULTS = {
     "CameraExposure": exposure_of_two,
     "CameraLens": focal_length_doubled,
     "TextureCoordinates": texture_coordinates_in_the_next_tile,
+    "ObjectMesh": mesh_lost,
     "FitRange": roughness_above_one,
     "RecordRange": negative_texels,
     "FitStatus": measured_without_values,

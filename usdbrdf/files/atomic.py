@@ -35,10 +35,16 @@ _TEMPORARY_PLACE = re.compile(
 # Of these calls may fail that ask for nothing but what is right.
 _OF_THE_MACHINE = {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE,
-    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM, errno.ETIMEDOUT,
+    errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM, errno.ETIMEDOUT, errno.EAGAIN,
 }  # fmt: skip
+# What Python says where the system gives it no thread: it has no errno, and no type of its own.
+_NO_THREAD = "can't start new thread"
+_MORE_PROCESSES = (
+    "Raise the limits on processes (ulimit -u, or the container's) and on address space (ulimit -v)"
+)
 # What helps against some of them, where it is neither space nor permission.
 _CURES = {
+    errno.EAGAIN: _MORE_PROCESSES,
     errno.EFBIG: "Raise this shell's limit on the size of files (ulimit -f), or name another disk",
     errno.EMFILE: "Raise this shell's limit on open files (ulimit -n)",
     errno.ENFILE: "Close other programs, which hold all files that this machine can open",
@@ -268,8 +274,14 @@ def _failure(subject: str, error: MemoryError | OSError) -> EnvironmentFailure:
 
 
 def failure_of_machine(error: Exception) -> EnvironmentFailure | None:
-    """What an error comes to that nobody expected where it came from: of permission, disk or open
-    files it is the machine's whoever asks, say whether there is a file; else None, a defect."""
+    """What an error comes to that nobody expected where it came from: of permission, disk, open
+    files or threads it is the machine's whoever asks, say whether there is a file; else None, a
+    defect."""
+    if isinstance(error, RuntimeError) and str(error).startswith(_NO_THREAD):
+        return EnvironmentFailure(
+            f"this machine starts no more threads. {_MORE_PROCESSES}, then run the same command "
+            "again; finished work is kept. [environment.processes]"
+        )
     if not isinstance(error, OSError) or error.errno not in _OF_THE_MACHINE:
         return None
     return _failure(str(_place_of(error) or "this machine"), error)

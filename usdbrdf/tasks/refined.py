@@ -45,7 +45,8 @@ def fitted_objects(
             FittedObject(
                 prim_path=obj.prim_path,
                 identifier=obj.identifier,
-                cost=own.cost,
+                # What the rays' noise brings is taken off, and may be more than there was.
+                cost=0.0 if own.cost < 0 else own.cost,
                 evidence=own.evidence,
                 target_frame=own.target if math.isfinite(own.phi) else -1,
                 num_pixels=own.num_samples,

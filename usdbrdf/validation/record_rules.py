@@ -12,7 +12,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from usdbrdf.asset.layers.scan_layer import lens_from_pinhole
-from usdbrdf.asset.properties import FIT, INSTANCE, SHADING, Fact, facts_by_attribute
+from usdbrdf.asset.properties import FIT, INSTANCE, SHADING, TEXTURING, Fact, facts_by_attribute
 from usdbrdf.asset.readers.scene import LENS, authored
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, cure, rule
 
@@ -21,6 +21,8 @@ _TOLERANCE = 1e-3
 _UV_TOLERANCE = 1e-4
 _EXPOSURE = ("exposure", *(f"exposure:{n}" for n in ("time", "fStop", "iso", "responsivity")))
 _PINHOLE = ("usdBrdf:capture:pinhole", "usdBrdf:capture:resolution")
+# What each step but the first says of every object.
+_MEASURED = tuple(schema.attribute(schema.key) for schema in (TEXTURING, SHADING, FIT))
 # The table, by the attributes' names.
 FACTS = facts_by_attribute()
 
@@ -120,6 +122,25 @@ def texture_coordinates(scene: AssetStage) -> Iterator[Fault]:
         elif uv.min() < -_UV_TOLERANCE or uv.max() > 1.0 + _UV_TOLERANCE:
             span = f"{uv.min():.4g} to {uv.max():.4g}"
             yield Fault(item, f"primvars:st goes from {span}; the maps from 0 to 1.")
+
+
+@rule(Severity.ERROR)
+def object_mesh(scene: AssetStage) -> Iterator[Fault]:
+    """What was measured is of a mesh that the stage has, and there is one at least. A layer of the
+    scan that lost its meshes opens without a word, and shows nothing.
+
+    Take that layer from a copy of the asset, or run usdbrdf convert again with --discard."""
+    # What was not loaded is not lost.
+    loaded = scene.stage.GetLoadRules() == Usd.StageLoadRules.LoadAll()
+    if scene.asset is None or scene.missing_layers or not loaded:
+        return
+    every = Usd.PrimRange.Stage(scene.stage, Usd.PrimAllPrimsPredicate)
+    records = [p for p in every if any(authored(p, name) is not None for name in _MEASURED)]
+    lost = [prim for prim in records if not prim.IsDefined()]
+    for prim in lost:
+        yield Fault(prim, "there are records of a measurement of it, and no mesh.")
+    if not lost and scene.root_prim and not scene.objects:
+        yield Fault(scene.root_prim, "the asset has no objects.")
 
 
 @rule(Severity.ERROR)

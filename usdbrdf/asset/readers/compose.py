@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from pxr import Sdf, Tf, Usd, UsdUtils
 
@@ -23,7 +23,7 @@ from usdbrdf.asset.readers.tried import (
     try_layers,
 )
 from usdbrdf.errors import InputRefused, UsdBrdfError
-from usdbrdf.files.atomic import sha256_of
+from usdbrdf.files.atomic import environment_failures, sha256_of
 from usdbrdf.job.child import run_child
 from usdbrdf.job.progress import say
 from usdbrdf.job.stamp import STATE_FOLDER, hash_of_files, read_stamp
@@ -34,6 +34,15 @@ from usdbrdf.untrusted.usd_paths import words_of
 _MAX_LENGTH = 600
 # An asset path with a scheme, as USD's messages spell it.
 _ADDRESS = re.compile(r"@[A-Za-z][A-Za-z0-9+.-]+:/")
+# What USD says of a layer that another names and it passes over, whatever the reason, which it may
+# tell.
+_PASSED_OVER = re.compile(
+    r"Could not (?:load sublayer|open asset) @(?P<file>/[^@]*)@ "
+    r"(?:of layer|for \w+ introduced by) @(?P<by>[^@]*)@(?:<[^>]*>)?"
+    r"(?: -- (?P<why>.*?))?(?:[\s;]*skipping)?"
+)
+# How USD's parser calls its own rules.
+_OF_PARSER = re.compile(r"\bpxrInternal\w+::(\w+::)*")
 
 
 def in_one_line(error: object) -> str:
@@ -42,6 +51,7 @@ def in_one_line(error: object) -> str:
     told = error.args if isinstance(error, Tf.ErrorException) else [error]
     parts = (words_of(part) for part in told)
     text = "; ".join(" ".join(part.split()).rstrip(".; ") for part in parts)
+    text = _OF_PARSER.sub("", text)
     return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]} ..."
 
 
@@ -170,6 +180,8 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
             "earlier copy of it. [stage.open]"
         ) from error
     if problems:
+        if passed_over := _PASSED_OVER.fullmatch(problems[0]):
+            _refuse_named(**passed_over.groupdict())
         cure = "Correct that layer, or bring back the file that it names."
         if _ADDRESS.search(problems[0]):
             cure = (
@@ -180,6 +192,22 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
             f"{subject}: the stage does not compose: {problems[0]}. {cure} [stage.open]"
         )
     return stage
+
+
+def _refuse_named(file: str, by: str, why: str | None) -> NoReturn:
+    """What there is to say of a layer that another names, and USD cannot read."""
+    if not Path(file).exists():
+        raise InputRefused(
+            f"{file}: this layer, which {by} names, is missing. Bring it back, or take its name "
+            "out there. [stage.open]"
+        )
+    with environment_failures(file):
+        Path(file).open("rb").close()
+    said = f" ({why})" if why else ""
+    raise InputRefused(
+        f"{file}: USD cannot read this layer{said}. Correct it, or take an earlier copy of it. "
+        "[stage.open]"
+    )
 
 
 def named_files(layer: Sdf.Layer) -> set[str]:

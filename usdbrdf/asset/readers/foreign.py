@@ -1,15 +1,19 @@
 """What an asset's layers say may have been written by anybody: any prim may be missing, and any
-attribute of ours may have a value of another type, or none."""
+attribute of ours may have a value of another type, or none. What is just as we wrote it is not to
+blame: who stumbles there is us."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from pxr import Usd
 
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.atomic import sha256_of
+from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.untrusted.usd_paths import words_of
 
 P = ParamSpec("P")
@@ -21,7 +25,9 @@ _STUMBLES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeErr
 
 def refuses_foreign(what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """A function that reads ``what`` in one of its arguments, a stage or a prim, and finds it, or
-    says in a sentence (InputRefused) that it is not what we would have written there."""
+    says in a sentence (InputRefused) that it is not what we would have written there. Where all
+    layers have the bytes that our steps recorded, that would be untrue: the defect is raised as it
+    is."""
 
     def of_reader(reader: Callable[P, R]) -> Callable[P, R]:
         @wraps(reader)
@@ -29,6 +35,8 @@ def refuses_foreign(what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             try:
                 return reader(*given, **named)
             except _STUMBLES as error:
+                if _is_as_written(_stage_of(*given)):
+                    raise
                 said = " ".join(words_of(error).split())[:_MAX_LENGTH]
                 raise InputRefused(
                     f"{place_of(*given)}: what the layers say of {what} is not what usdbrdf writes "
@@ -43,8 +51,31 @@ def refuses_foreign(what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 def place_of(*given: Any) -> str:
     """The file by which a stage, or that of a prim, the first of ``given``, is to be named."""
-    place = next(each for each in given if isinstance(each, Usd.Stage | Usd.Prim))
-    layer = (place.GetStage() if isinstance(place, Usd.Prim) else place).GetRootLayer()
+    layer = _stage_of(*given).GetRootLayer()
     # Of a stage that we put together, the strongest of its layers.
     below = [*layer.subLayerPaths] if layer.anonymous else []
     return str((below or [layer.identifier])[0])
+
+
+def _stage_of(*given: Any) -> Usd.Stage:
+    place = next(each for each in given if isinstance(each, Usd.Stage | Usd.Prim))
+    return place.GetStage() if isinstance(place, Usd.Prim) else place
+
+
+def _is_as_written(stage: Usd.Stage) -> bool:
+    """Whether every file that the stage is made of is one that a step of ours recorded so."""
+    files = [Path(layer.realPath) for layer in stage.GetUsedLayers() if not layer.anonymous]
+    folder = next(
+        (up for file in files for up in file.parents if (up / STATE_FOLDER).is_dir()), None
+    )
+    if folder is None or any(
+        layer.dirty and not layer.anonymous for layer in stage.GetUsedLayers()
+    ):
+        return False
+    known = known_hashes(folder / STATE_FOLDER)
+    return all(
+        file.is_relative_to(folder)
+        and file.is_file()
+        and sha256_of(file) in known.get(file.relative_to(folder).as_posix(), ())
+        for file in files
+    )

@@ -1,5 +1,6 @@
 """Identifiers from hostile labels."""
 
+import hashlib
 import random
 import re
 
@@ -68,3 +69,46 @@ def test_any_labels_give_legal_unique_names(seed):
 
 def test_a_good_label_is_stored_unchanged():
     assert readable_label("Stuhl Nº 1 椅子") == "Stuhl Nº 1 椅子"
+
+
+def suffix(text):
+    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:8]
+
+
+def test_suffixes_are_of_the_label_and_of_how_often_it_occurred():
+    names = unique_identifiers(["a b", "a b", "A-B", "a b", "c"])
+    assert names == [
+        "a_b", f"a_b_{suffix('1:a b')}", f"A_B_{suffix('0:A-B')}", f"a_b_{suffix('2:a b')}", "c",
+    ]  # fmt: skip
+    # Whose suffix is a label of its own.
+    taken = f"a_b_{suffix('1:a b')}"
+    assert unique_identifiers(["a b", "a b", taken]) == ["a_b", f"a_b_{suffix('2:a b')}", taken]
+
+
+def test_known_names_are_nobodys():
+    assert unique_identifiers(["chair", "x"], known=["Chair"]) == [
+        f"chair_{suffix('0:chair')}",
+        "x",
+    ]
+    assert unique_identifiers(["", "\u6905"], fallback="part") == [
+        "part",
+        f"part_{suffix('0:' + chr(0x6905))}",
+    ]
+
+
+def test_long_names_keep_room_for_their_suffix():
+    whole = "a" * 64
+    first, second, third = unique_identifiers([whole, whole + "b", whole + "c"])
+    assert first == whole
+    assert (second, third) == tuple("a" * 55 + "_" + suffix(f"0:{whole}{c}") for c in "bc")
+
+
+@pytest.mark.parametrize("name", ["aux", "CON", "Nul", "prn", "com0", "COM9", "lpt0", "lpt9"])
+def test_names_of_devices_are_no_files(name):
+    assert identifier_from(name) == f"_{name}"
+    assert identifier_from(name + "0") == name + "0"
+
+
+def test_labels_keep_what_usd_can_store():
+    assert readable_label("Stuhl\tN\u00ba 1\x7f\x85") == "Stuhl\ufffdN\u00ba 1\ufffd\ufffd"
+    assert readable_label("\ud800a") == "?a"

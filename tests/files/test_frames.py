@@ -17,6 +17,7 @@ from usdbrdf.files.frames import (
     photograph_limits,
     read_frame,
     read_frames,
+    transparent_of,
 )
 from usdbrdf.model.capture import Frames
 
@@ -209,3 +210,10 @@ def test_frames_are_kept_as_far_as_memory_goes(tmp_path, monkeypatch, kept, deco
         ]
         assert shown == [(i, i + 0.5) for i in order]
     assert counted == decoded
+
+
+@pytest.mark.parametrize(("alpha", "kept"), [(0.985, False), (0.995, True), (1.5, True)])
+def test_what_filters_leave_of_alpha_is_there(alpha, kept):
+    stored = np.full((2, 3, 4), 1.0, np.float32)
+    stored[0, 1, 3] = alpha
+    assert transparent_of(stored).sum() == (not kept)
