@@ -71,13 +71,13 @@ def test_an_extra_that_is_not_there_breaks_nothing(told, monkeypatch):
     [("mitsuba", "not used without Mitsuba"), ("pyoidn", "relight takes Mitsuba's slow way: ")],
 )
 def test_nothing_is_asked_for_that_would_be_of_no_use(monkeypatch, package, text):
-    def not_there(_: str) -> None:
+    def not_there() -> None:
         raise EnvironmentFailure("not there")
 
     monkeypatch.setattr(render, "mitsuba_variant", not_there)
     version = doctor._version
     monkeypatch.setattr(doctor, "_version", lambda name: None if name == package else version(name))
-    (found,) = (one for one in doctor.examine() if one.name == "LLVM")
+    (found,) = (one for one in doctor._programs() if one.name == "LLVM")
     assert found.state == "missing"
     assert found.text.startswith(text)
 
