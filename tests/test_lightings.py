@@ -16,6 +16,7 @@ from pxr import Sdf, Usd, UsdShade
 
 import usdbrdf
 from tests.delivery.packing import packed
+from tests.json_schemas import checked
 from tests.scenes import edited, make_capture, poses_down_and_up
 from usdbrdf.asset.adopt import adopt
 from usdbrdf.asset.advice import read_advice
@@ -169,6 +170,12 @@ def test_frames_are_those_of_the_lighting(asset, captures):
     assert maps.own_frames == range(12, 24)
     stage = open_edited(asset)
     assert stage.GetEndTimeCode() == 24
+
+
+def test_what_is_printed_of_several_lightings_is_as_its_schema_says(asset, captures, capsys):
+    assert _convert(captures, asset.folder, "--json") == 0
+    told = checked(capsys.readouterr().out, "run")
+    assert [*told["steps"]["texture"]["lightings"]] == [*LIGHTINGS]
 
 
 def _files(stage: Usd.Stage) -> set[Path]:
