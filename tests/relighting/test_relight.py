@@ -16,6 +16,9 @@ from pxr import Sdf
 
 from tests.json_schemas import checked
 from tests.relighting.conftest import BASE
+from usdbrdf.asset.header import read_header
+from usdbrdf.asset.layers.scan_layer import write_pending_layer
+from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
 from usdbrdf.errors import OwnershipConflict, UsdBrdfError
 from usdbrdf.files.images import read_radiance
@@ -79,6 +82,16 @@ def _mean(room: Path, **options: object) -> np.ndarray:
 def test_the_captured_lamp_lights_the_floor(room: Path) -> None:
     # L = rho / pi * pi * L_lamp * form factor; the colours show that channels keep their order.
     assert _mean(room) == pytest.approx(_FLOOR * _LAMP * _FORM, rel=0.02)
+
+
+def test_what_was_not_measured_yet_is_told(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _mean(room)
+    assert "was not run" not in capsys.readouterr().err
+    layer = Asset.made(room).layer("material")
+    write_pending_layer(layer, "material", read_header(room / "layers/scan.usdc"))
+    _mean(room)
+    told = "room: the step fit was not run; the picture lacks what it measures."
+    assert told in capsys.readouterr().err
 
 
 def test_an_artists_override_is_rendered_and_the_asset_stays(room: Path) -> None:
