@@ -23,6 +23,7 @@ from usdbrdf.cli import main
 from usdbrdf.errors import OwnershipConflict, UsdBrdfError
 from usdbrdf.files.images import read_radiance
 from usdbrdf.options import RelightOptions
+from usdbrdf.relighting import description
 from usdbrdf.relighting.relight import relight
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
 
@@ -99,6 +100,19 @@ def test_an_artists_override_is_rendered_and_the_asset_stays(room: Path) -> None
     before = {p: p.read_bytes() for p in room.rglob("*") if p.is_file()}
     assert _mean(room) == pytest.approx(0.4 * _LAMP * _FORM, rel=0.02)
     assert {p: p.read_bytes() for p in room.rglob("*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_where_nothing_reflects_what_glows_is_seen_and_no_light_is_looked_for(
+    room: Path, monkeypatch: pytest.MonkeyPatch, variant: str
+) -> None:
+    _choose(monkeypatch, variant)
+    glows = "= (0, 0, 0)\ncolor3f inputs:emissiveColor = (0.5, 0.25, 0.125)"
+    (room / "edits.usda").write_text(_EDIT.replace("= (0.4, 0.4, 0.4)", glows))
+    asked: list[dict[str, object]] = []
+    monkeypatch.setattr(description, "integrator", lambda bounces: asked.append({}))
+    assert _mean(room) == pytest.approx([0.5, 0.25, 0.125], rel=1e-3)
+    assert asked == []
 
 
 def test_what_the_artist_hides_is_gone(room: Path) -> None:
