@@ -300,7 +300,8 @@ def build(folder: Path, scan: Scan, *, upto="material", prims=None) -> Built:
         if role in done:
             built.write_layer(role)
         else:
-            for layer in (asset.layer(role), asset.interface(role)):
+            beneath = {"texturing": [asset.uv_layer], "shading": [asset.lights_layer]}
+            for layer in (asset.layer(role), asset.interface(role), *beneath.get(role, ())):
                 write_pending_layer(layer, role, header)
     write_contents(asset.contents_layer, asset, header)
     write_edits(asset.edits_layer, asset, header)

@@ -14,6 +14,8 @@ import pytest
 
 from usdbrdf import doctor
 from usdbrdf.cli import main
+from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.relighting import render
 from usdbrdf.transport.rays import Hits, RayScene
 
 
@@ -62,6 +64,22 @@ def test_an_extra_that_is_not_there_breaks_nothing(told, monkeypatch):
     assert found["raw"]["state"] == "missing"
     cure = "nowhere-to-be-had not installed: pip install 'usdbrdf[raw]'"
     assert found["raw"]["text"] == cure
+
+
+@pytest.mark.parametrize(
+    ("package", "text"),
+    [("mitsuba", "not used without Mitsuba"), ("pyoidn", "relight takes Mitsuba's slow way: ")],
+)
+def test_nothing_is_asked_for_that_would_be_of_no_use(monkeypatch, package, text):
+    def not_there() -> None:
+        raise EnvironmentFailure("not there")
+
+    monkeypatch.setattr(render, "mitsuba_variant", not_there)
+    version = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name == package else version(name))
+    (found,) = (one for one in doctor._programs() if one.name == "LLVM")
+    assert found.state == "missing"
+    assert found.text.startswith(text)
 
 
 def test_rays_that_meet_the_wrong_thing_are_broken(told, monkeypatch):

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.json_schemas import SCHEMAS, check, schema_of
+from tests.json_schemas import INPUTS, SCHEMAS, check, schema_of
 from tests.scenes import make_capture
+from usdbrdf.asset.properties import FittedObject, facts_of
 from usdbrdf.cli import main
 from usdbrdf.commands import COMMANDS
 from usdbrdf.model.mesh import DIRECTIVES
@@ -16,8 +17,7 @@ from usdbrdf.option import option_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = sorted(file.name.removesuffix(".schema.json") for file in SCHEMAS.glob("*.json"))
-# Documents that no command prints, and the commands that print the same.
-INPUTS, OF_STEPS = {"transforms", "objects"}, {"convert", "ingest", "texture", "shade", "fit"}
+OF_STEPS = {"convert", "ingest", "texture", "shade", "fit"}
 SILENT = {"view"}  # it serves until it is stopped
 jsonschema = pytest.importorskip("jsonschema", reason="needs the extra test")
 
@@ -70,6 +70,20 @@ def test_runs_and_captures(tmp_path, capsys):
     document["frames"][0]["exposure_time"] = 0
     with pytest.raises(jsonschema.ValidationError):
         check(document, "transforms")
+
+
+def test_what_a_schema_does_not_name_is_found():
+    done = {"reran": False, "reason": "done", "texels": 7}
+    check({"asset": "a.usda", "steps": {"texture": done}}, "run")
+    with pytest.raises(jsonschema.ValidationError, match="texel_count"):
+        check({"asset": "a.usda", "steps": {"texture": {**done, "texel_count": 7}}}, "run")
+
+
+def test_words_of_a_fit_are_those_of_the_asset():
+    facts, told = dict(facts_of(FittedObject)), schema_of("run")["$defs"]["fitted"]["properties"]
+    enums = {name: item["enum"] for name, item in told.items() if "enum" in item}
+    assert {*enums} >= {"status", "kind", "phi_confidence", "psi_confidence", "directive"}
+    assert enums == {name: [*facts[name].tokens] for name in enums}
 
 
 def test_what_a_fit_says_is_checked():

@@ -8,12 +8,15 @@ import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdShade
 
 import usdbrdf
+from tests.delivery.packing import packed
+from tests.json_schemas import checked
 from tests.scenes import edited, make_capture, poses_down_and_up
 from usdbrdf.asset.adopt import adopt
 from usdbrdf.asset.advice import read_advice
@@ -167,6 +170,54 @@ def test_frames_are_those_of_the_lighting(asset, captures):
     assert maps.own_frames == range(12, 24)
     stage = open_edited(asset)
     assert stage.GetEndTimeCode() == 24
+
+
+def test_what_is_printed_of_several_lightings_is_as_its_schema_says(asset, captures, capsys):
+    assert _convert(captures, asset.folder, "--json") == 0
+    told = checked(capsys.readouterr().out, "run")
+    assert [*told["steps"]["texture"]["lightings"]] == [*LIGHTINGS]
+
+
+def _files(stage: Usd.Stage) -> set[Path]:
+    return {Path(layer.realPath) for layer in stage.GetUsedLayers() if not layer.anonymous}
+
+
+def test_the_root_tells_before_it_is_loaded_which_layers_its_payload_opens(asset):
+    root, loads = str(asset.root_layer), set()
+    light = Usd.Stage.Open(root, Usd.Stage.LoadNone)
+    told = light.GetDefaultPrim().GetAssetInfoByKey("payloadAssetDependencies")
+    for name in LIGHTINGS:
+        stages = [Usd.Stage.Open(root, load) for load in (Usd.Stage.LoadAll, Usd.Stage.LoadNone)]
+        for stage in stages:
+            stage.SetEditTarget(stage.GetSessionLayer())
+            stage.GetDefaultPrim().GetVariantSet("lighting").SetVariantSelection(name)
+        loads |= _files(stages[0]) - _files(stages[1])
+    assert {Path(path.resolvedPath) for path in told} == loads
+
+
+def test_a_package_of_the_whole_shows_each_lighting(asset, tmp_path):
+    output = packed(SimpleNamespace(asset=asset), tmp_path, whole=True)
+    packages = [Usd.Stage.Open(str(output)), Usd.Stage.Open(str(output), Usd.Stage.LoadNone)]
+    for name in LIGHTINGS:
+        here = open_edited(asset.in_lighting(name))
+        for stage in packages:
+            stage.SetEditTarget(stage.GetSessionLayer())
+            choice = stage.GetDefaultPrim().GetVariantSet("lighting")
+            assert choice.GetVariantNames() == [*LIGHTINGS]
+            choice.SetVariantSelection(name)
+            sets = [one.GetDefaultPrim().GetVariantSet("lights") for one in (stage, here)]
+            assert sets[0].GetVariantNames() == sets[1].GetVariantNames()
+        there = packages[0]
+        assert {p.GetPath() for p in there.Traverse()} == {p.GetPath() for p in here.Traverse()}
+        for prim in there.Traverse():
+            for attribute in prim.GetAttributes():
+                value = attribute.Get()
+                if isinstance(value, Sdf.AssetPath) and value.path:
+                    assert value.resolvedPath.startswith(f"{output}["), attribute.GetPath()
+        for obj in ("lamp", "box"):
+            path = f"/room/geo/{obj}/{obj}"
+            assert read_shading(there, path).radiance == read_shading(here, path).radiance
+            assert _colour(there, obj) == _colour(here, obj)
 
 
 def test_the_asset_keeps_all_rules(asset, capsys):

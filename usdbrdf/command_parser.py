@@ -14,7 +14,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -33,6 +33,14 @@ EXIT_CODES = """exit codes:
   7 validate found errors, or a step warned and --strict was given
   130 interrupted   143 terminated"""
 _INSERT_KEYS = {item.option.name: item for item in option_fields(Insert) if item.option}
+# In a folder of fpath the script is a function of its file's name; sourced it says whose it is.
+_ZSH_SOURCED = """
+if [[ ${funcstack[1]} == _usdbrdf ]]; then
+  _cyclopts_usdbrdf "$@"
+else
+  compdef _cyclopts_usdbrdf usdbrdf
+fi
+"""
 
 
 class Command(Options):
@@ -62,7 +70,7 @@ def parsed(arguments: Sequence[str], commands: Commands) -> Command:
             from cyclopts import App, CycloptsError
         app = App(name=f"usdbrdf {name}", help_flags=(), version_flags=())
 
-        app.default(_signed(said))
+        app.default(_signed(said, _argument))
         try:
             given = app.parse_args(words, exit_on_error=False, print_error=False)[1].arguments
         except CycloptsError as error:
@@ -106,19 +114,24 @@ def completion(shell: str, commands: Commands) -> str:
 
     app = App(name="usdbrdf", help_flags=("--help", "-h"), version_flags=("--version",))
     for name, owner in commands.items():
-        signed = _signed(_said(owner))
+        signed = _signed(_said(owner), _completed)
         signed.__doc__ = owner.__doc__
         app.command(signed, name=name)
-    return str(app.generate_completion(shell=shell))  # type: ignore[arg-type]
+    script = str(app.generate_completion(shell=shell))  # type: ignore[arg-type]
+    if shell == "zsh":
+        return script + _ZSH_SOURCED
+    # Bash itself quotes names of files and tells folders from them.
+    script = script.replace('COMPREPLY=( $(compgen -f -- "${cur}") )', "COMPREPLY=()")
+    return script.replace("complete -F ", "complete -o bashdefault -o default -F ")
 
 
-def _signed(said: Sequence[_Said]) -> Any:
+def _signed(said: Sequence[_Said], argument: Callable[[_Said], inspect.Parameter]) -> Any:
     """A function that does nothing, with the signature that these options make."""
 
     def bound() -> None: ...
 
     signed: Any = bound
-    signed.__signature__ = inspect.Signature([_argument(item) for item in said])
+    signed.__signature__ = inspect.Signature([argument(item) for item in said])
     return signed
 
 
@@ -190,6 +203,25 @@ def _argument(said: _Said) -> inspect.Parameter:
         # As wide as what ``read`` makes, and the default: where pydantic is loaded, cyclopts has it
         # check the values against these.
         annotation=Annotated[(list[Any] if several else kind) | None, parameter],
+    )
+
+
+def _completed(said: _Said) -> inspect.Parameter:
+    """The same for shells, which ask only what kind of word follows, if any does."""
+    from cyclopts import Parameter
+
+    option, kind = said.option, said.field.kind
+    if get_origin(kind) is tuple or option.joined:
+        kind = list[Path] if kind == tuple[Path, ...] else list[str]
+    flag = kind is bool
+    return inspect.Parameter(
+        _key(option),
+        inspect.Parameter.POSITIONAL_ONLY if option.placed else inspect.Parameter.KEYWORD_ONLY,
+        default=inspect.Parameter.empty if option.placed else False if flag else None,
+        annotation=Annotated[
+            kind if option.placed or flag else kind | None,
+            Parameter(name=option.names, negative=()),
+        ],
     )
 
 

@@ -178,7 +178,8 @@ def _programs() -> Iterator[Finding]:
             text=found or otherwise,
         )
 
-    yield told("LLVM", _llvm(), "relight takes Mitsuba's slow way: apt install libllvm19")
+    slow = "relight takes Mitsuba's slow way: apt install libllvm19"
+    yield told("LLVM", _llvm(), slow if _version("mitsuba") else "not used without Mitsuba")
     gl = ctypes.util.find_library("EGL") or ctypes.util.find_library("GL")
     storm = gl if gl and find_spec("pxr.UsdImagingGL") else None
     yield told("Storm", storm, "no GL, or USD without imaging: usdview and usdrecord need both")

@@ -8,7 +8,8 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 
 from usdbrdf.asset.header import Provenance, new_layer, refuse_old_layout
-from usdbrdf.asset.layers.interface import components_of
+from usdbrdf.asset.layers.interface import components_of, write_interface
+from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import ROLES
 from usdbrdf.asset.readers.compose import open_measured, open_weaker
 from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
@@ -49,6 +50,23 @@ def test_without_payloads_there_are_boxes_and_choices_alone(built):
         np.testing.assert_allclose(boxes[0], boxes[1], atol=1e-6)
     root.Load()
     assert UsdGeom.Mesh.Get(light, built.prims[0])
+
+
+@pytest.mark.parametrize("networks", [False, True])
+def test_what_the_payload_opens_is_told_before_it_is_loaded(built, networks):
+    asset = built.asset
+    if networks:
+        layer, draft = asset.layer("material"), built.draft("material")
+        write_material_layer(layer, draft, built.fitted, materialx=asset.materialx_layer)
+        write_interface(asset.interface("material"), layer)
+    light, full = opened(asset, Usd.Stage.LoadNone), opened(asset)
+    used = [{each.realPath for each in stage.GetUsedLayers()} for stage in (light, full)]
+    info = light.GetDefaultPrim().GetAssetInfo()
+    told = {path.resolvedPath for path in info["payloadAssetDependencies"]}
+    assert told == {path for path in used[1] - used[0] if path}
+    assert (str(asset.materialx_layer) in told) == networks
+    assert info["version"] == "work"
+    assert {"previews", "identifier"} <= {*info}
 
 
 @pytest.mark.parametrize("upto", ROLES)

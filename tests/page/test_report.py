@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import math
 import re
 import shutil
 from dataclasses import replace
@@ -17,6 +18,7 @@ from pxr import Usd
 import usdbrdf
 from tests.page.conftest import data_of
 from usdbrdf.asset.maps import camera_hits
+from usdbrdf.asset.properties import FittedObject
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView, measured_atlas, viewed_asset
 from usdbrdf.model.material import turned_up
@@ -227,6 +229,26 @@ def test_the_texture_of_a_map_is_made_once_for_all_cameras():
     assert all((picture.reshape(2, 3)[1] == _BACKGROUND).all() for picture in pictures)
 
 
+def fit_of(**numbers):
+    usual = {"status": "prior", "evidence": 0.4, "target_frame": 0, "cost": 0.0, "num_pixels": 9,
+             "method": "views"}  # fmt: skip
+    return FittedObject(prim_path="/r", identifier="r", phi=0.3, psi=0.5, **usual | numbers)
+
+
+def test_evidence_is_drawn_of_what_was_fitted_alone(monkeypatch):
+    monkeypatch.setattr(objects, "_looked_at", lambda *_: None)
+    monkeypatch.setattr(objects, "_pictures", lambda *_, **__: {})
+    monkeypatch.setattr(objects, "_evidence", lambda *_: np.ones((1, 1)))
+    words = ["measured", "prior", "failed", "prior", "prior", "lamp", "unseen"]
+    monkeypatch.setattr(objects, "_numbers", lambda _a, i, *_: {"status": words[i]})
+    fits = [fit_of(status=word) for word in words]
+    fits[3:5] = fit_of(evidence=math.nan), fit_of(directive="glass")
+    where = Seen(share=np.full((1, 7), 0.1, np.float32), box=np.zeros((1, 7, 4), np.float32))
+    atlas = SimpleNamespace(frames=None, scene=SimpleNamespace(objects=[None] * 7))
+    rows = objects.object_rows(atlas, None, fits, where, [0], photographs=True, seed=0)
+    assert ["costs" in row for row in rows] == [True, True, True, False, False, False, False]
+
+
 def test_a_frame_is_read_and_traced_once_however_many_objects_it_shows(monkeypatch):
     """Object 0 has its target frame, 1 the frame that shows most of it, 3 that of frame 7 too; no
     frame shows 2."""
@@ -236,17 +258,18 @@ def test_a_frame_is_read_and_traced_once_however_many_objects_it_shows(monkeypat
     monkeypatch.setattr(objects, "seen_in_frame", lambda _, view: traced.append(view.camera))
     monkeypatch.setattr(objects, "_numbers", lambda _a, i, *_: {"prim": i, "status": "prior"})
 
-    def pictures(frame, _seen, index, box, _status, **_):
+    def pictures(frame, _seen, index, box, **_):
         assert frame.view.camera == frame.number
         drawn.append((index, frame.number, box.tolist()))
         return {"frame": frame.number}
 
     monkeypatch.setattr(objects, "_pictures", pictures)
+    monkeypatch.setattr(objects, "_evidence", lambda *_: None)
     share = np.array([[0.1, 0.2, 0, 0.1], [0.3, 0.1, 0, 0.2]], np.float32)
     where = Seen(share=share, box=np.arange(8, dtype=np.float32).reshape(2, 4, 1))
     frames = SimpleNamespace(camera=int)
     atlas = SimpleNamespace(frames=frames, scene=SimpleNamespace(objects=[None] * 4))
-    fits = [SimpleNamespace(target_frame=target) for target in (3, -1, -1, 7)]
+    fits = [fit_of(target_frame=target) for target in (3, -1, -1, 7)]
     seen = SimpleNamespace(lit=None)
     rows = objects.object_rows(atlas, seen, fits, where, [3, 7], photographs=True, seed=0)
     assert [row["prim"] for row in rows] == [0, 1, 2, 3]
@@ -350,6 +373,15 @@ def test_a_copy_without_its_photographs_is_told_what_it_lacks(room, tmp_path):
     (copy / "layers/photographs.usdc").unlink()
     with pytest.raises(InputRefused, match=r"room: it has no layers/photographs\.usdc"):
         report(copy, tmp_path / "page.html")
+
+
+@pytest.mark.parametrize("gone", ["contents.usda", "scan.interface.usda", "shading.usda"])
+def test_an_asset_that_nobody_can_open_has_no_page(room, tmp_path, gone):
+    shutil.copytree(room.asset, tmp_path / "room")
+    (tmp_path / "room/layers" / gone).unlink()
+    with pytest.raises(InputRefused, match=rf"{gone}: this layer.*\[asset\.incomplete\]$"):
+        report(tmp_path / "room", tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
 
 
 def test_texels_that_mirror_daylight_are_no_lamp(room):

@@ -130,3 +130,28 @@ def test_samples_follow_the_density(mi: Any, phi: float, psi: float, rho: float,
         mi.chi2.SphericalDomain(), sample, density, sample_dim=3, res=101, ires=8
     )
     assert chi2.run(significance_level=0.001)
+
+
+@pytest.mark.parametrize("kind", [PAPER, DIELECTRIC, BECKMANN])
+def test_lobes_of_many_objects_share_their_code(mi: Any, kind: int) -> None:
+    """Else what has to be compiled grows with the objects."""
+    import drjit as dr
+
+    def operations(count: int) -> int:
+        scene: dict[str, Any] = {"type": "scene", "light": {"type": "constant"}}
+        for i in range(count):
+            bsdf = {**_plugin(0.1 + 0.05 * i, 0.5, 0.3), "lobe": kind}
+            scene[f"ball_{i}"] = {"type": "sphere", "center": [2.0 * i, 0.0, 0.0], "bsdf": bsdf}
+        film = {"type": "hdrfilm", "width": 4, "height": 4}
+        sensor = mi.load_dict({"type": "perspective", "film": film})
+        integrator = mi.load_dict({"type": "path", "max_depth": 3})
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            image = mi.render(
+                mi.load_dict(scene, optimize=False), sensor=sensor, integrator=integrator, spp=1
+            )
+            dr.eval(image)
+            dr.sync_thread()
+            return max(kernel.get("operation_count", 0) for kernel in dr.kernel_history())
+
+    assert operations(2) == operations(6) > 0

@@ -16,10 +16,14 @@ from pxr import Sdf
 
 from tests.json_schemas import checked
 from tests.relighting.conftest import BASE
+from usdbrdf.asset.header import read_header
+from usdbrdf.asset.layers.scan_layer import write_pending_layer
+from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
 from usdbrdf.errors import OwnershipConflict, UsdBrdfError
 from usdbrdf.files.images import read_radiance
 from usdbrdf.options import RelightOptions
+from usdbrdf.relighting import description
 from usdbrdf.relighting.relight import relight
 from usdbrdf.relighting.render import VARIANTS, mitsuba_variant
 
@@ -81,11 +85,34 @@ def test_the_captured_lamp_lights_the_floor(room: Path) -> None:
     assert _mean(room) == pytest.approx(_FLOOR * _LAMP * _FORM, rel=0.02)
 
 
+def test_what_was_not_measured_yet_is_told(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _mean(room)
+    assert "was not run" not in capsys.readouterr().err
+    layer = Asset.made(room).layer("material")
+    write_pending_layer(layer, "material", read_header(room / "layers/scan.usdc"))
+    _mean(room)
+    told = "room: the step fit was not run; the picture lacks what it measures."
+    assert told in capsys.readouterr().err
+
+
 def test_an_artists_override_is_rendered_and_the_asset_stays(room: Path) -> None:
     (room / "edits.usda").write_text(_EDIT)
     before = {p: p.read_bytes() for p in room.rglob("*") if p.is_file()}
     assert _mean(room) == pytest.approx(0.4 * _LAMP * _FORM, rel=0.02)
     assert {p: p.read_bytes() for p in room.rglob("*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_where_nothing_reflects_what_glows_is_seen_and_no_light_is_looked_for(
+    room: Path, monkeypatch: pytest.MonkeyPatch, variant: str
+) -> None:
+    _choose(monkeypatch, variant)
+    glows = "= (0, 0, 0)\ncolor3f inputs:emissiveColor = (0.5, 0.25, 0.125)"
+    (room / "edits.usda").write_text(_EDIT.replace("= (0.4, 0.4, 0.4)", glows))
+    asked: list[dict[str, object]] = []
+    monkeypatch.setattr(description, "integrator", lambda bounces: asked.append({}))
+    assert _mean(room) == pytest.approx([0.5, 0.25, 0.125], rel=1e-3)
+    assert asked == []
 
 
 def test_what_the_artist_hides_is_gone(room: Path) -> None:

@@ -194,6 +194,14 @@ class Asset:
     def _of_lighting(self) -> str:
         return f".{self.lighting}" if self.lighting else ""
 
+    def layers_of_payload(self, lightings: Iterable[str]) -> list[Path]:
+        """The layers that loading the payload of an asset of these lightings opens, () being one,
+        but for those that it has by the choice of whoever fits its materials."""
+        common = [self.contents_layer, *map(self.layer, ROLES), self.uv_layer]
+        each = [replace(self, lighting=name) for name in lightings]
+        own = [one.layer(role) for one in each for role in ROLES[1:3]]
+        return [*common, *own, *(one.lights_layer for one in each or [self])]
+
     def refuse_output(self, output: Path, rule: str) -> None:
         """UsageError for a place inside the folder: what reads an asset leaves it as it is."""
         if output.resolve().is_relative_to(self.folder.resolve()):

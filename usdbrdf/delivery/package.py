@@ -20,7 +20,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from usdbrdf.asset.header import Scopes
 from usdbrdf.asset.layers.author import export
-from usdbrdf.asset.layers.interface import UNPUBLISHED
+from usdbrdf.asset.layers.interface import NEEDS, UNPUBLISHED
 from usdbrdf.asset.layers.lights_layer import DAYLIGHT, EMISSIVE, LIGHTS, USDLUX
 from usdbrdf.asset.layers.looks import SHADED, VARIANT_SET
 from usdbrdf.asset.layout import Asset
@@ -145,7 +145,7 @@ def flattened(stage: Usd.Stage, asset: Asset, *, with_lights: bool = True) -> Us
     flat.RemovePrim(Scopes.of(asset).path("render"))
     for prim in flat.TraverseAll():
         info = dict(prim.GetAssetInfo())
-        for name in ("identifier", "payloadAssetDependencies"):  # of the asset in its folder
+        for name in ("identifier", NEEDS):  # of the asset in its folder
             info.pop(name, None)
         if info.get("version") == UNPUBLISHED:
             info.pop("version")

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.preview_lobe import BECKMANN_FACETS
-from usdbrdf.asset.readers.compose import open_measured
+from usdbrdf.asset.readers.compose import open_measured, refuse_missing
 from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.asset.readers.views import Views, photographs_of_views
 from usdbrdf.errors import InputRefused
@@ -102,8 +102,10 @@ def evaluate(
 
 
 def measured_atlas(folder: Path, lighting: str | None = None) -> tuple[Asset, AssetMaps]:
-    """The maps of an asset that all steps have been through, without the artist's layer."""
+    """The maps of an asset that all steps have been through, without the artist's layer.
+    InputRefused for one that others cannot open, whatever was measured."""
     asset = Asset.made(folder).in_lighting(lighting)
+    refuse_missing(asset, 1 + len(ROLES))
     return asset, AssetMaps(open_measured(asset))
 
 

@@ -59,10 +59,12 @@ def object_rows(
     for at, i in progress(order, total=len(order), label="report", unit="objects"):
         if looked is None or at != read:
             read, looked = at, _looked_at(atlas.frames, chosen[at], seen)
-        rows[i] |= _pictures(
-            looked, seen, i, where.box[at, i], rows[i]["status"],
-            photographs=photographs, seed=seed,
-        )  # fmt: skip
+        rows[i] |= _pictures(looked, seen, i, where.box[at, i], photographs=photographs, seed=seed)
+        costs = (
+            _evidence(seen, looked, i, seed) if _was_fitted(fits[i], rows[i]["status"]) else None
+        )
+        if costs is not None:
+            rows[i]["costs"] = {"phis": _PHIS, "psis": _PSIS, "values": costs.round(4).tolist()}
     return rows
 
 
@@ -210,12 +212,11 @@ def _pictures(
     seen: ViewedAsset,
     index: int,
     box: Sequence[float],
-    status: str,
     *,
     photographs: bool,
     seed: int,
 ) -> dict[str, Any]:
-    """The object in a frame: photograph and model's picture of one exposure, and the evidence."""
+    """The object in a frame: photograph and model's picture of one exposure."""
     part = part_around(frame.view.camera, box)
     predicted = predict_view(seen, part.camera, _PICTURE, seed + index)
     small = part.of(frame.pixels)
@@ -229,13 +230,12 @@ def _pictures(
     if photographs:
         picture = to_display_srgb8(np.nan_to_num(small.radiance), exposure_scale=exposure)
         found["photograph"] = data_uri(picture)
-    if status != "lamp":
-        costs = _evidence(seen, frame, index, seed)
-        if costs is not None:
-            found["costs"] = {
-                "phis": _PHIS, "psis": _PSIS, "values": costs.round(4).tolist(),
-            }  # fmt: skip
     return found
+
+
+def _was_fitted(fit: FittedObject, status: str) -> bool:
+    """Whether there is a fit for a frame to be evidence of."""
+    return undetermined_because(fit, status) not in ("lamp", "unseen", "told", "sparse")
 
 
 def _evidence(seen: ViewedAsset, frame: _LookedAt, index: int, seed: int) -> Double | None:

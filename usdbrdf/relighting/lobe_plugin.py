@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,19 @@ def register(mi: Any) -> None:
     # The base class exists only once a variant is set, so the class is made here.
     import drjit as dr
 
+    @cache
+    def tables() -> tuple[Any, Any]:
+        """What facets take, one for all lobes: each with its own would be code of its own."""
+        shares = facet_shares()
+        knots = np.stack([shares.base, shares.rise], axis=-1)
+        means = np.concatenate(shares[2:], axis=1)
+        found = (
+            mi.Texture2f(mi.TensorXf(np.ascontiguousarray(knots, np.float32))),
+            mi.Texture1f(mi.TensorXf(np.ascontiguousarray(means, np.float32))),
+        )
+        dr.eval(found)  # what is not computed yet would be code of the first lobe alone
+        return found
+
     class Lobe(mi.BSDF):  # type: ignore[misc]
         def __init__(self, props: Any) -> None:
             mi.BSDF.__init__(self, props)
@@ -53,11 +67,7 @@ def register(mi: Any) -> None:
             glossy = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide
             matte = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             if is_dielectric(self.kind):
-                shares = facet_shares()
-                knots = np.stack([shares.base, shares.rise], axis=-1)
-                means = np.concatenate(shares[2:], axis=1)
-                self.facets = mi.Texture2f(mi.TensorXf(np.ascontiguousarray(knots, np.float32)))
-                self.means = mi.Texture1f(mi.TensorXf(np.ascontiguousarray(means, np.float32)))
+                self.facets, self.means = tables()
             self.m_components = [glossy, matte]
             self.m_flags = glossy | matte
 

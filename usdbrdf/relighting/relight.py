@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.readers.compose import open_edited, recorded_photographs
+from usdbrdf.asset.readers.compose import not_run, open_edited, recorded_photographs, steps_to_come
 from usdbrdf.asset.readers.render_scene import (
     eye_height,
     render_scene_from_stage,
@@ -50,6 +50,9 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
     _check(options, output, asset)
     mitsuba, noise = mitsuba_variant(), chosen_filter(options.denoise)
     stage = open_edited(asset)
+    if missing := steps_to_come(asset):
+        measures = "it measures" if len(missing) == 1 else "they measure"
+        warn(f"{asset.folder}: {not_run(missing)}; the picture lacks what {measures}.")
     time = time_code(stage, options.frame)
     captured = render_scene_from_stage(stage, time, warn)
     if options.views is None:

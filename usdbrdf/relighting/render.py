@@ -48,7 +48,12 @@ def mitsuba_variant(variant: str | None = None) -> Any:
 
 def mitsuba_scene(mi: Any, scene: RelitScene, *, bounces: int) -> Any:
     """A loaded scene whose integrator follows ``bounces`` reflections; black where nothing is."""
-    parts: dict[str, Any] = {"type": "scene", "integrator": description.integrator(bounces)}
+    reflects = any(s.material.diffuse.any() or s.material.f0.any() for s in scene.surfaces)
+    # Where all only glow, as before materials are fitted, no light is looked for: Mitsuba compiles
+    # that for every glowing mesh, minutes for hundreds.
+    seen_alone = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
+    integrator = description.integrator(bounces) if reflects else seen_alone
+    parts: dict[str, Any] = {"type": "scene", "integrator": integrator}
     # A clear pane would only hide the lights behind it from the rays that look for them.
     for i, surface in enumerate(s for s in scene.surfaces if not s.material.clear):
         parts[f"surface_{i}"] = _mesh(mi, surface)

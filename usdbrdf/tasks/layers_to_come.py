@@ -19,7 +19,8 @@ def write_layers_to_come(
     that holds them all."""
     each = [replace(asset, lighting=name) for name in lightings] or [asset]
     chosen = ("texturing", "shading") if lightings else ()
-    pending = {asset.uv_layer: "texturing"} if lightings else {}
+    # What their sublayers will be is told to whoever asks what the asset needs.
+    pending = {asset.uv_layer: "texturing", **{one.lights_layer: "shading" for one in each}}
     for role in ROLES[1:]:
         for one in each if role in chosen or not lightings else (asset,):
             pending |= {one.layer(role): role, one.interface(role): role}

@@ -39,6 +39,8 @@ UNPUBLISHED = "work"
 _PER_UNIT = 1024
 # An abstract prim that a shot may define, to say something of all copies of an asset at once.
 _CLASSES = "/__class__"
+# Of assetInfo: files that loading the payload opens, for who asks before it is loaded.
+NEEDS = "payloadAssetDependencies"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +148,8 @@ def write_interface(path: Path, *layers: Path) -> None:
                 root.variantSelections[name] = selected
         if source.HasInfo("assetInfo"):
             root.SetInfo("assetInfo", source.GetInfo("assetInfo"))
-            apply_schema(root, *source.GetInfo("apiSchemas").prependedItems)
+            if source.HasInfo("apiSchemas"):
+                apply_schema(root, *source.GetInfo("apiSchemas").prependedItems)
     export(layer, path, folder=path.parent)
 
 
@@ -165,7 +168,7 @@ def write_scan_interface(
     root = define(layer, scopes.root, "" if source and source.GetTypeName() else "Xform")
     if not (source and source.HasAuthoredMetadata("kind")):
         root.SetInfo("kind", "assembly")
-    needs = [asset.contents_layer, *(asset.layer(role) for role in ROLES)]
+    needs = asset.layers_of_payload(dict.fromkeys(scan.frames.lightings))
     if scan.usd_geometry:
         needs.append(scan.usd_geometry)
     root.inheritPathList.prependedItems = [Sdf.Path(f"{_CLASSES}/{asset.name}")]
@@ -192,6 +195,14 @@ def write_scan_interface(
     export(layer, path, folder=asset.layer("scan").parent)
 
 
+def needs_too(root: Sdf.PrimSpec, asset: Asset, layers: Sequence[Path]) -> None:
+    """Beside what the interface of the scan tells of, the payload opens these."""
+    interface = Sdf.Layer.OpenAsAnonymous(str(asset.interface("scan")))
+    known = interface.GetPrimAtPath(root.path).GetInfo("assetInfo").get(NEEDS, [])
+    needs = [*known, *(Sdf.AssetPath(f"./{layer.name}") for layer in layers)]
+    root.SetInfo("assetInfo", {NEEDS: Sdf.AssetPathArray(needs)})
+
+
 def _author_model(
     prim: Sdf.PrimSpec, asset: Asset, name: str, file: str, needs: Sequence[Path], box: Float
 ) -> None:
@@ -203,7 +214,7 @@ def _author_model(
         "identifier": Sdf.AssetPath(f"../{file}"),
         "name": name,
         "version": UNPUBLISHED,
-        "payloadAssetDependencies": Sdf.AssetPathArray(dependencies),
+        NEEDS: Sdf.AssetPathArray(dependencies),
     }
     prim.SetInfo("assetInfo", info)
     apply_schema(prim, "GeomModelAPI")

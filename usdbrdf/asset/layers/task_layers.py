@@ -27,6 +27,7 @@ from usdbrdf.asset.layers.author import (
     over,
     relationship,
 )
+from usdbrdf.asset.layers.interface import needs_too
 from usdbrdf.asset.layers.looks import (
     ALBEDO_TEXTURE,
     EMISSION_TEXTURE,
@@ -272,6 +273,9 @@ def write_material_layer(
         for material, (item, shown, texture) in networks.items():
             _author_network(beneath, material, item, shown, texture)
         export(beneath, materialx, folder=asset.materialx_layer.parent)
+    own = [one.layer("material") for one in asset.in_each_lighting if one.lighting]
+    if needed := own + [asset.materialx_layer] * bool(materialx):
+        needs_too(layer.GetPrimAtPath(scopes.root), asset, needed)
     export(layer, path, folder=asset.layer("material").parent)
 
 

@@ -302,7 +302,8 @@
 
   /* What lobes leave unexplained of the target frame, over phi and psi. */
   function evidence(one) {
-    const none = one.status === 'lamp' ? 'What shines by itself is not fitted.' : 'Too few pixels for a plot.';
+    const told = ['ignore', 'glass'].includes(one.directive);
+    const none = one.status === 'lamp' ? 'What shines by itself is not fitted.' : told ? 'Nothing was fitted, by directive.' : 'Too few pixels for a plot.';
     if (!one.costs) return [el('h3', {}, 'Evidence'), el('p', { class: 'soft' }, none)];
     const { phis, psis, values } = one.costs;
     const [width, height, left, top, side] = [290, 232, 38, 8, 200];
