@@ -1,4 +1,4 @@
-"""ScanNet++: the photographs of dslr/, else of iphone/, with the laser scan and the objects of scans/.
+"""ScanNet++: the photographs of dslr/, else of iphone/, with the mesh and the objects of scans/.
 
 The COLMAP models and the mesh share a frame; transforms.json beside them has its axes changed, so
 of that of undistorted photographs the lens alone is read.
