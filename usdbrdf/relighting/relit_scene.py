@@ -27,6 +27,7 @@ from usdbrdf.model.material import (
     with_corner_colours,
 )
 from usdbrdf.options import Insert, RelightOptions
+from usdbrdf.transport.environment import in_working_space
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.mesh_files import model_from_file
 from usdbrdf.untrusted.pictures import picture_from_file
@@ -96,8 +97,9 @@ def _light_of_file(
     file: Path, up_axis: str, allow: Sequence[Path]
 ) -> tuple[Sequence[Surface], Sequence[Light]]:
     if file.suffix.lower() in SKY_SUFFIXES:
-        radiance = picture_from_file(file) / factors_of_hdr(file).astype(np.float32)
-        return (), (sky_of_picture(radiance, up_axis),)
+        radiance = picture_from_file(file)
+        radiance /= factors_of_hdr(file).astype(np.float32)
+        return (), (sky_of_picture(in_working_space(radiance, file), up_axis),)
     found = _scene_of_others(file, allow)
     if not _emits_light(found):
         raise InputRefused(
