@@ -136,3 +136,17 @@ def test_refusals(photographed, damage, sentence):
     damage(photographed)
     with pytest.raises(InputRefused, match=sentence):
         read_scan(photographed, IngestOptions())
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+def test_what_is_up_need_not_be_square_to_the_view(photographed, room, tilt):
+    """Rounded to decimals, or tilted towards what is looked at."""
+    cameras = [str(FRAMES)]
+    for pose in room.world_from_camera:
+        origin, up, ahead = pose[:3, 3], pose[:3, 1], -pose[:3, 2]
+        rows = (origin, origin + ahead, up + tilt * ahead if tilt else up.round(3))
+        cameras += [" ".join(f"{x:.9f}" for x in row) for row in rows]
+    (photographed / "cam.txt").write_text("\n".join(cameras))
+    frames = read_scan(photographed, IngestOptions()).frames
+    # No nearer than what the rounding turns.
+    np.testing.assert_allclose(frames.world_from_camera, room.world_from_camera, atol=1e-3)

@@ -139,3 +139,17 @@ def test_frames_are_told_of_where_there_is_no_mesh(capture):
     found = inspect(capture, InspectOptions(assume_srgb=True))
     assert found.summary()["frames"]["count"] == len(truth().images)
     assert "[mesh.missing]" in str(found.refusals[0])
+
+
+@pytest.mark.parametrize("name", ["images_8", "images_64x48"])
+def test_smaller_pictures_where_the_others_were_not_passed_on(capture, room, name):
+    """As LLFF's minify makes them; of several the largest are taken."""
+    rows = np.load(capture / "poses_bounds.npy")
+    rows[:, [4, 9, 14]] *= 4
+    np.save(capture / "poses_bounds.npy", rows)
+    (capture / "images").rename(capture / "images_4")
+    for i, image in enumerate(room.images):
+        write_image(capture / name / f"image{i:03d}.png", image[::2, ::2])
+    scan = read_scan(capture, OPTIONS)
+    assert_same(scan, room)
+    assert {path.parent.name for path in scan.frames.image_paths} == {"images_4"}

@@ -10,7 +10,7 @@ import pytest
 
 from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image
 from tests.scenes import write_ply
-from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.capture.adapters import choose_adapter, files_beside, read_scan
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
 
@@ -154,3 +154,19 @@ def test_refusals(scene, damage, sentence):
     damage(scene)
     with pytest.raises(InputRefused, match=sentence):
         read_scan(scene, OPTIONS, adapter="scannet")
+
+
+def test_the_objects_beside_a_mesh_that_is_named(scene, room):
+    """What reader.py unpacked into a folder of its own, without the mesh."""
+    exported = scene / "exported"
+    exported.mkdir()
+    for name in ("color", "pose", "intrinsic"):
+        (scene / name).rename(exported / name)
+    mesh = scene / "scene0000_00_vh_clean_2.ply"
+    scan = read_scan(exported, IngestOptions(assume_srgb=True, mesh=mesh))
+    assert_same(scan, room, names=tuple(f"{name}_{i}" for i, name in enumerate(room.names)))
+    beside = files_beside(choose_adapter(exported), exported, mesh)
+    assert [file.name for file in beside] == [
+        "scene0000_00.aggregation.json",
+        "scene0000_00_vh_clean_2.0.010000.segs.json",
+    ]

@@ -116,3 +116,85 @@ def test_refusals(scene, damage, sentence):
     damage(scene)
     with pytest.raises(InputRefused, match=sentence):
         read_scan(scene, OPTIONS)
+
+
+def _fisheye_model(scene, room):
+    fx, fy, cx, cy = room.intrinsics[0]
+    numbers = f"{0.8 * fx} {0.8 * fy} {cx + 1} {cy} -0.03 0.01 0 0"
+    text = f"1 OPENCV_FISHEYE {WIDTH} {HEIGHT} {numbers}\n"
+    (scene / "dslr" / "colmap" / "cameras.txt").write_text(text)
+
+
+def _undistorted(scene, room, name="resized_undistorted_images"):
+    """As dslr/undistort.py of the dataset's toolkit leaves them; its poses are in other axes."""
+    _fisheye_model(scene, room)
+    (scene / "dslr" / "resized_images").rename(scene / "dslr" / name)
+    lens = dict(zip(("fl_x", "fl_y", "cx", "cy"), room.intrinsics[0].tolist(), strict=True))
+    said = {**lens, "w": WIDTH, "h": HEIGHT, "k1": 0.0, "camera_model": "PINHOLE", "frames": []}
+    document = scene / "dslr" / "nerfstudio" / "transforms_undistorted.json"
+    document.parent.mkdir()
+    document.write_text(json.dumps(said))
+    return document
+
+
+@pytest.mark.parametrize("name", ["resized_undistorted_images", "undistorted_images"])
+def test_undistorted_photographs_have_the_lens_that_was_written_with_them(scene, room, name):
+    _undistorted(scene, room, name)
+    masks = {"resized_undistorted_images": "resized_undistorted_masks"}
+    folder = scene / "dslr" / masks.get(name, "undistorted_anon_masks")
+    write_image(folder / "DSC00003.png", np.ones((HEIGHT, WIDTH, 3)))
+    scan = read_scan(scene, OPTIONS)
+    assert_same(scan, room)
+    assert any("1 masks are used" in warning for warning in scan.warnings)
+
+
+def test_undistorted_photographs_without_their_lens_are_refused(scene, room):
+    document = _undistorted(scene, room)
+    document.write_text("{}")
+    with pytest.raises(InputRefused, match=r"does not state a PINHOLE.*\[capture.camera\]"):
+        read_scan(scene, OPTIONS)
+    document.unlink()
+    with pytest.raises(InputRefused, match=r"not there.*resized_images\. \[capture.camera\]"):
+        read_scan(scene, OPTIONS)
+
+
+def test_original_photographs_have_their_own_masks(scene, room):
+    (scene / "dslr" / "resized_images").rename(scene / "dslr" / "original_images")
+    for i in range(len(room.images)):
+        mask = np.ones((HEIGHT, WIDTH, 3))
+        write_image(scene / "dslr" / "original_anon_masks" / f"DSC{i:05d}.png", mask)
+    scan = read_scan(scene, OPTIONS)
+    assert any("10 masks are used" in warning for warning in scan.warnings)
+
+
+def _telephone(scene):
+    """As iphone/prepare_iphone_data.py leaves a scene of which dslr/ was not downloaded."""
+    dslr, iphone = scene / "dslr", scene / "iphone"
+    iphone.mkdir()
+    (dslr / "colmap").rename(iphone / "colmap")
+    (dslr / "resized_images").rename(iphone / "rgb")
+    dslr.rmdir()
+    text = (iphone / "colmap" / "images.txt").read_text()
+    for path in sorted((iphone / "rgb").iterdir()):
+        name = f"frame_{10 * int(path.stem[3:]):06d}.jpg"
+        text = text.replace(path.name, name)
+        path.rename(path.with_name(name))
+    (iphone / "colmap" / "images.txt").write_text(text)
+    (iphone / "pose_intrinsic_imu.json").write_text("{}")
+    return iphone
+
+
+def test_a_telephones_pictures_where_there_is_no_dslr(scene, room):
+    _telephone(scene)
+    assert choose_adapter(scene).name == "scannetpp"
+    scan = read_scan(scene, OPTIONS)
+    assert_same(scan, room)
+    assert "floor_1" in [each.label for each in scan.objects]
+
+
+def test_a_telephones_video_is_to_be_extracted(scene):
+    iphone = _telephone(scene)
+    for path in (iphone / "rgb").iterdir():
+        path.unlink()
+    with pytest.raises(InputRefused, match=r"no pictures in iphone/rgb.*\[capture.frames\]"):
+        read_scan(scene, OPTIONS)

@@ -710,3 +710,14 @@ def test_a_header_that_asks_for_memory_is_the_file_s_fault(tmp_path):
     path.write_bytes(content)
     with pytest.raises(ImageRefused, match=r"\[image\.\w+\]$"):
         read_radiance(path)
+
+
+def test_an_exr_of_whole_numbers_is_refused(tmp_path):
+    """Five passed for 5 / 2^32."""
+    path = tmp_path / "counts.exr"
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), oiio.ImageSpec(4, 4, 3, "uint"))
+    assert output.write_image(np.full((4, 4, 3), 5, np.uint32))
+    assert output.close()
+    with pytest.raises(ImageRefused, match=r"whole numbers \(UINT\).*\[image.channels\]"):
+        read_radiance(path)

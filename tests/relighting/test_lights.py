@@ -14,7 +14,8 @@ from usdbrdf.asset.readers.render_scene import render_scene_from_file
 from usdbrdf.files.images import write_exr
 from usdbrdf.model.light import DistantLight, Light, RelitScene, ShapeLight, SkyLight
 from usdbrdf.model.material import UNKNOWN_DIFFUSE, constant_map
-from usdbrdf.relighting.relit_scene import lit_by_others
+from usdbrdf.relighting.relit_scene import _light_of_file, lit_by_others
+from usdbrdf.transport.environment import environment_from_file
 
 _HEADER = '#usda 1.0\n(\n    metersPerUnit = 0.01\n    upAxis = "{up}"\n)\n'
 
@@ -87,6 +88,31 @@ def test_dome_with_a_picture(tmp_path: Path) -> None:
     assert isinstance(light, SkyLight)
     assert light.image == pytest.approx(np.full((2, 4, 3), 1.5))
     assert light.world_from_here == pytest.approx(np.eye(3))
+
+
+def test_a_radiance_picture_is_divided_by_the_exposure_that_it_states(tmp_path: Path) -> None:
+    """Pixels of 2, which were doubled twice."""
+    file = tmp_path / "sky.hdr"
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\nEXPOSURE=2\n\n-Y 2 +X 4\n"
+    file.write_bytes(head + bytes([128, 128, 128, 130]) * 8)
+    _, (light,) = _light_of_file(file, "Y", ())
+    assert isinstance(light, SkyLight)
+    assert light.image == pytest.approx(np.full((2, 4, 3), 0.5), rel=0.01)
+
+
+def test_a_radiance_picture_has_the_primaries_that_it_states(tmp_path: Path) -> None:
+    """Display P3's green, which BT.709's three make of less red and blue than nothing."""
+    file = tmp_path / "sky.hdr"
+    primaries = b"PRIMARIES=0.68 0.32 0.265 0.69 0.15 0.06 0.3127 0.329\n"
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n" + primaries + b"\n-Y 2 +X 4\n"
+    file.write_bytes(head + bytes([64, 128, 64, 129]) * 8)
+    _, (light,) = _light_of_file(file, "Y", ())
+    assert isinstance(light, SkyLight)
+    # Half white and half green: P3's green in BT.709 is -0.2249, 1.0421, -0.0786.
+    expected = 0.5 + 0.5 * np.array([-0.2249, 1.0421, -0.0786])
+    assert light.image[0, 0] == pytest.approx(expected, rel=0.02)
+    found = environment_from_file(file, "Y").image
+    assert found[0, 0] == pytest.approx(expected, rel=0.02)
 
 
 def test_dark_hidden_and_inactive_lights_are_none(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ MODULES = {
 }
 DESCRIPTIONS = {
     "eyeful-tower": "room of Eyeful Tower (cameras.json, images-2k/, mesh.obj)",
-    "scannetpp": "scene of ScanNet++ (dslr/, scans/)",
+    "scannetpp": "scene of ScanNet++ (dslr/ or iphone/, and scans/)",
     "scannet": "scene of ScanNet, unpacked (color/, pose/, intrinsic/, *_vh_clean_2.ply)",
     "polycam": "raw data of Polycam (keyframes/, raw.glb, mesh_info.json)",
     "meshroom": "cameras of Meshroom (cameras.sfm), pictures, its mesh",

@@ -201,6 +201,22 @@ _PROGRAMS = (
         "KITTI", (), (), rb"\A(?:[-+.\de]+ ){11}[-+.\de]+\r?\n",
         f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)", "poses.txt",
     ),
+    _Program(
+        "Replica for Semantic-NeRF", ("traj_w_c.txt",), (), _NOTHING,
+        f"{_BY_HAND}, and name the scene's mesh in it",
+    ),
+    _Program(
+        "RTAB-Map", (), (), rb"\A#timestamp x y z qx qy qz qw",
+        f"{_BY_HAND}, and put the mesh that it exports beside it",
+    ),
+    _Program(
+        "MultiScan", (), (), rb'\A\s*\{[^\n]*"exposure_duration"',
+        f"Extract the video's frames. {_BY_HAND} and its mesh",
+    ),
+    _Program(
+        "Project Aria", (".vrs", "closed_loop_trajectory.csv"), (), _NOTHING,
+        f"{_BY_HAND} (projectaria_tools exports both), and name a mesh in it",
+    ),
     _Program("EuRoC", (), (), rb"\A#timestamp.*p_RS_R_x", f"{_BY_HAND}, and fuse a mesh (Open3D)"),
     _Program(
         "Stray Scanner", (), (), rb"\Atimestamp, *frame, *x, *y, *z, *qx",

@@ -84,6 +84,13 @@ def _radiance(path: Path, max_side: int, alpha: bool) -> Float:
         cure = "It is grey: export it in colour" if grey else "Export the beauty pass as R, G, B"
         raise ImageRefused(f"{path}: {said}. {cure}. [image.channels]")
     channels = [colours[letter] for letter in ("rgba" if alpha else "rgb") if letter in colours]
+    # OpenImageIO has them between 0 and 1, of four thousand millions, which is black.
+    kinds = {str(source.spec().channelformat(channel)) for channel in channels}
+    if source.format_name() == "openexr" and "uint" in kinds:
+        raise ImageRefused(
+            f"{path}: its R, G and B are whole numbers (UINT), of which nothing says what is "
+            "white. Export them as HALF or FLOAT. [image.channels]"
+        )
     pixels = pixels_of(path, source)
     if channels != list(range(pixels.shape[2])):
         pixels = pixels[..., channels]

@@ -11,6 +11,7 @@ import numpy as np
 
 from usdbrdf.asset.readers.render_scene import RenderScene, render_scene_from_file, sky_of_picture
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.files.radiance_header import factors_of_hdr
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Bool, Double, Float, Int
@@ -26,6 +27,7 @@ from usdbrdf.model.material import (
     with_corner_colours,
 )
 from usdbrdf.options import Insert, RelightOptions
+from usdbrdf.transport.environment import in_working_space
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.mesh_files import model_from_file
 from usdbrdf.untrusted.pictures import picture_from_file
@@ -95,7 +97,9 @@ def _light_of_file(
     file: Path, up_axis: str, allow: Sequence[Path]
 ) -> tuple[Sequence[Surface], Sequence[Light]]:
     if file.suffix.lower() in SKY_SUFFIXES:
-        return (), (sky_of_picture(picture_from_file(file), up_axis),)
+        radiance = picture_from_file(file)
+        radiance /= factors_of_hdr(file).astype(np.float32)
+        return (), (sky_of_picture(in_working_space(radiance, file), up_axis),)
     found = _scene_of_others(file, allow)
     if not _emits_light(found):
         raise InputRefused(

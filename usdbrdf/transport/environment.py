@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.colour import WORKING_SPACE, to_working_space
+from usdbrdf.files.colour import WORKING_SPACE, encoding_of_tag, kind_of_encoding, to_working_space
+from usdbrdf.files.images import colour_tag
 from usdbrdf.files.radiance_header import factors_of_hdr
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Double, Float, Long
@@ -126,7 +127,16 @@ def environment_from_file(picture: Path | None, up_axis: str) -> Environment:
             f"{picture}: an 8- or 16-bit picture ends at white and holds no radiance; give an "
             "OpenEXR or Radiance HDR file as --environment. [shading.environment]"
         )
-    return with_sun_apart(to_working_space(image, WORKING_SPACE), up_axis == "Z")
+    return with_sun_apart(in_working_space(image, picture), up_axis == "Z")
+
+
+def in_working_space(image: Float, picture: Path) -> Float:
+    """The pixels of a picture of light by the primaries that its header states; the working space's
+    where it states none that are known. Colours that this space lacks lose what is negative."""
+    tag = encoding_of_tag(*colour_tag(picture))
+    if tag is None or tag == WORKING_SPACE or kind_of_encoding(tag) != "linear":
+        return image
+    return np.maximum(to_working_space(image, tag), np.float32(0))
 
 
 # Radians around the brightest pixel in which a sun lies, and in which the sky beside it is looked

@@ -87,7 +87,10 @@ def _photographed(folder: Path, findings: Findings) -> list[FrameRecord]:
         image = folder / "Image" / f"{i:03d}_0001.exr"
         origin, target, up = camera
         ahead = (target - origin) / (np.linalg.norm(target - origin) or 1.0)
-        axes = np.stack([np.cross(ahead, up), up, -ahead], axis=1)
+        # Up is of three decimals in some files, or only roughly up: made square to the view.
+        right = np.cross(ahead, up)
+        right /= np.linalg.norm(right) or 1.0
+        axes = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
         record = _record(image, rigid_pose(axes, origin), lens, findings)
         records += [record] if record else []
     return records

@@ -7,6 +7,7 @@ nearest and the farthest depth. The principal point is the picture's middle.
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.formats.named_pictures import (
+    FOLDERS,
     mesh_beside,
     pictures_of,
     refuse_without_pictures,
@@ -49,7 +51,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             f"{source}: an array of shape {rows.shape}, not one row of 17 numbers per picture. "
             "Write it again with imgs2poses. [capture.format]"
         )
-    pictures = pictures_of(folder, options)
+    pictures = pictures_of(folder, options, *FOLDERS[:-1], *_scaled(folder), FOLDERS[-1])
     refuse_without_pictures(pictures, source)
     paths = pictures.paths
     if len(paths) != len(rows):  # photographs and their radiance, or depths, beside each other?
@@ -100,3 +102,14 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         folder=folder,
         up_axis=up_axis_assumed(records, options, findings, source.name),
     )
+
+
+def _scaled(folder: Path) -> list[str]:
+    """The folders of smaller pictures (images_4, images_1008x756), the largest first; many who pass
+    a capture on leave out the pictures that these were made of."""
+    found = []
+    for place in folder.glob("images_*"):
+        if sizes := re.fullmatch(r"images_(\d{1,2})|images_(\d{1,5})x\d{1,5}", place.name):
+            factor, width = sizes.groups()
+            found.append((factor is None, int(factor) if factor else -int(width), place.name))
+    return [name for *_, name in sorted(found)]

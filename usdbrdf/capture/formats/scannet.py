@@ -105,8 +105,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
     how = f"Download the scene's *{_MESH}"
     mesh = partial(mesh_beside, folder, options, f"*{_MESH}", "*_vh_clean.ply", how=how)
-    meshes = sorted(folder.glob(f"*{_MESH}")) if options.mesh is None else []
-    scene = meshes[0].name.removesuffix(_MESH) if meshes else ""
+    meshes = [options.mesh] if options.mesh is not None else sorted(folder.glob(f"*{_MESH}"))
+    segments = _objects_beside(meshes[0]) if meshes else ()
     return scan_of(
         records,
         mesh,
@@ -115,8 +115,21 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         adapter=NAME,
         source=source,
         folder=folder,
-        objects=annotated_objects(folder / f"{scene}{_SEGMENTS}", folder / f"{scene}{_GROUPS}"),
+        objects=annotated_objects(*segments) if segments else None,
     )
+
+
+def _objects_beside(mesh: Path) -> tuple[Path, ...]:
+    """The segments and groups of a mesh of ScanNet's; () of another."""
+    scene = mesh.name.removesuffix(_MESH)
+    if scene == mesh.name:
+        return ()
+    return mesh.with_name(f"{scene}{_SEGMENTS}"), mesh.with_name(f"{scene}{_GROUPS}")
+
+
+def beside_mesh(mesh: Path) -> list[Path]:
+    """The files that say the objects of a mesh of ScanNet's, as far as they are there."""
+    return [file for file in _objects_beside(mesh) if file.is_file()]
 
 
 class _Camera(NamedTuple):
