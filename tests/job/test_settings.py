@@ -11,10 +11,12 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.job.compiler import refuse_unusable_settings
 from usdbrdf.job.processes import refuse_few_threads
 
+THREADS = "OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS", "PXR_WORK_THREAD_LIMIT"
+
 
 @pytest.fixture(autouse=True)
 def _no_settings(monkeypatch):
-    for name in ("NUMBA_DISABLE_JIT", "NUMBA_NUM_THREADS"):
+    for name in ("NUMBA_DISABLE_JIT", "NUMBA_NUM_THREADS", *THREADS):
         monkeypatch.delenv(name, raising=False)
 
 
@@ -62,3 +64,29 @@ def test_three_cores_want_six_threads_which_are_gone_afterwards(monkeypatch, gra
         refuse_few_threads()
     assert len(started) == min(granted, 6)
     assert not any(thread.is_alive() for thread in started)
+
+
+@pytest.mark.parametrize(
+    ("cores", "settings", "asked"),
+    [
+        (3, {}, 6),
+        (256, {}, 64 + 256),
+        (128, {"OPENBLAS_NUM_THREADS": "1", "PXR_WORK_THREAD_LIMIT": "2"}, 1 + 2),
+        (128, {"OPENBLAS_NUM_THREADS": "no", "OMP_NUM_THREADS": "8"}, 8 + 128),
+        (4, {"OMP_NUM_THREADS": "16", "PXR_WORK_THREAD_LIMIT": "-3"}, 4 + 1),
+        (4, {"OMP_NUM_THREADS": "0", "PXR_WORK_THREAD_LIMIT": "-9"}, 4 + 1),
+        (2, {"PXR_WORK_THREAD_LIMIT": "8"}, 2 + 2),
+    ],
+)
+def test_no_more_threads_are_asked_for_than_the_libraries_start(
+    monkeypatch, cores, settings, asked
+):
+    """A limit under which these work, as they are told to start few, is none for us."""
+    started = []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    monkeypatch.setattr(threading.Thread, "start", lambda thread: started.append(thread))
+    monkeypatch.setattr(threading.Thread, "join", lambda _: None)
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    refuse_few_threads()
+    assert len(started) == asked

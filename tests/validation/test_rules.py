@@ -89,6 +89,22 @@ def test_what_an_artist_may_say_is_no_fault(built):
     assert own(built) == []
 
 
+@pytest.mark.parametrize("prim", ["/room", "/room/geo"])
+@pytest.mark.parametrize("aside", ["active", "instanceable"])
+def test_objects_that_an_artist_sets_aside_are_not_lost(built, prim, aside):
+    with edited(built.asset.edits_layer) as layer:
+        Sdf.CreatePrimInLayer(layer, prim).SetInfo(aside, aside != "active")
+    assert own(built) == []
+
+
+def test_a_part_of_an_asset_has_lost_nothing(built):
+    mask = Usd.StagePopulationMask(["/room/cameras"])
+    assert own_findings(Usd.Stage.OpenMasked(str(built.asset.root_layer), mask)) == []
+    for layer in (built.asset.folder / "layers").iterdir():
+        found = own_findings(Usd.Stage.Open(str(layer)))
+        assert not [finding for finding in found if finding.rule == "usdbrdf.ObjectMesh"]
+
+
 @pytest.mark.parametrize("attribute", ["ior", "scale"])
 def test_a_lobe_that_was_matched_is_judged_as_such(built, attribute):
     built.fitted = tuple(replace(item, mapping="matched") for item in built.fitted)

@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 from threading import Event, Thread
 
-# USD and OpenBLAS start one for each core as they are loaded. Where they get none, one crashes and
-# the other interrupts us.
-_THREADS_OF_CORE = 2
+# OpenBLAS, as numpy and scipy bring it, starts no more than so many, and the first of these that is
+# a positive number says fewer.
+_MOST_OF_BLAS = 64
+_FEWER_OF_BLAS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 def refuse_few_threads() -> None:
     """RuntimeError, as of any thread that cannot be started, where there are too few for the
-    libraries to be loaded at all."""
+    libraries to be loaded at all: USD and OpenBLAS start one for each core, or as many as their
+    settings say. Where they get none, one crashes and the other interrupts us."""
     over = Event()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    count = _THREADS_OF_CORE * (cores or 1)
+    affinity = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
+    cores = len(affinity) or os.cpu_count() or 1
+    count = _of_blas(cores) + _of_usd(cores)
     threads = [Thread(target=over.wait, daemon=True) for _ in range(count)]
     started = []
     try:
@@ -26,3 +29,21 @@ def refuse_few_threads() -> None:
         over.set()
         for thread in started:
             thread.join()
+
+
+def _of_blas(cores: int) -> int:
+    told = next(filter(lambda number: number > 0, map(_number, _FEWER_OF_BLAS)), cores)
+    return min(cores, told, _MOST_OF_BLAS)
+
+
+def _of_usd(cores: int) -> int:
+    """PXR_WORK_THREAD_LIMIT: 0 for all cores, less than that for all but so many."""
+    limit = _number("PXR_WORK_THREAD_LIMIT")
+    return min(cores, limit) if limit > 0 else max(1, cores + limit)
+
+
+def _number(name: str) -> int:
+    try:
+        return int(os.environ[name])
+    except (KeyError, ValueError):
+        return 0

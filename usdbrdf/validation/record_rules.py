@@ -130,16 +130,19 @@ def object_mesh(scene: AssetStage) -> Iterator[Fault]:
     scan that lost its meshes opens without a word, and shows nothing.
 
     Take that layer from a copy of the asset, or run usdbrdf convert again with --discard."""
-    # What was not loaded is not lost.
+    # What was not loaded is not lost, and one layer alone is a part of an asset.
     loaded = scene.stage.GetLoadRules() == Usd.StageLoadRules.LoadAll()
-    if scene.asset is None or scene.missing_layers or not loaded:
+    masked = scene.stage.GetPopulationMask() != Usd.StagePopulationMask.All()
+    if scene.asset_root is None or scene.missing_layers or masked or not loaded:
         return
-    every = Usd.PrimRange.Stage(scene.stage, Usd.PrimAllPrimsPredicate)
+    every = list(Usd.PrimRange.Stage(scene.stage, Usd.PrimAllPrimsPredicate))
     records = [p for p in every if any(authored(p, name) is not None for name in _MEASURED)]
     lost = [prim for prim in records if not prim.IsDefined()]
     for prim in lost:
         yield Fault(prim, "there are records of a measurement of it, and no mesh.")
-    if not lost and scene.root_prim and not scene.objects:
+    # An artist may set any of them aside: beneath what is not active, or an instance, is nothing.
+    aside = any(not prim.IsActive() or prim.IsInstance() for prim in every)
+    if not lost and scene.root_prim and not scene.objects and not aside:
         yield Fault(scene.root_prim, "the asset has no objects.")
 
 

@@ -1,6 +1,6 @@
 """What an asset's layers say may have been written by anybody: any prim may be missing, and any
-attribute of ours may have a value of another type, or none. What is just as we wrote it is not to
-blame: who stumbles there is us."""
+attribute of ours may have a value of another type, or none. What is just as this version wrote it
+is not to blame: who stumbles there is us."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pxr import Usd
 
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import sha256_of
-from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
+from usdbrdf.job.stamp import STATE_FOLDER, code_version, hashes_in, read_stamp
 from usdbrdf.untrusted.usd_paths import words_of
 
 P = ParamSpec("P")
@@ -26,8 +26,8 @@ _STUMBLES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeErr
 def refuses_foreign(what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """A function that reads ``what`` in one of its arguments, a stage or a prim, and finds it, or
     says in a sentence (InputRefused) that it is not what we would have written there. Where all
-    layers have the bytes that our steps recorded, that would be untrue: the defect is raised as it
-    is."""
+    layers have the bytes that steps of this version recorded, that would be untrue: the defect is
+    raised as it is."""
 
     def of_reader(reader: Callable[P, R]) -> Callable[P, R]:
         @wraps(reader)
@@ -63,7 +63,8 @@ def _stage_of(*given: Any) -> Usd.Stage:
 
 
 def _is_as_written(stage: Usd.Stage) -> bool:
-    """Whether every file that the stage is made of is one that a step of ours recorded so."""
+    """Whether every file that the stage is made of is one that a step of this version recorded so:
+    of another one's we may not know what it means."""
     files = [Path(layer.realPath) for layer in stage.GetUsedLayers() if not layer.anonymous]
     folder = next(
         (up for file in files for up in file.parents if (up / STATE_FOLDER).is_dir()), None
@@ -72,7 +73,8 @@ def _is_as_written(stage: Usd.Stage) -> bool:
         layer.dirty and not layer.anonymous for layer in stage.GetUsedLayers()
     ):
         return False
-    known = known_hashes(folder / STATE_FOLDER)
+    stamps = map(read_stamp, (folder / STATE_FOLDER / "stamps").glob("*.json"))
+    known = hashes_in(one for one in stamps if one and one.version == code_version())
     return all(
         file.is_relative_to(folder)
         and file.is_file()
