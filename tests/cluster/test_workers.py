@@ -114,8 +114,8 @@ def test_the_bytes_are_the_same_though_workers_die_and_hang(
 ) -> None:
     chosen = ClusterOptions(workers=2, unit_limit=4)
     with workers_of(chosen) as workers:
-        # The first four are no units: light that is found in this process.
-        strike(monkeypatch, 5, lambda: os.kill(workers_on_this_machine()[0], signal.SIGKILL))
+        # The first six are no units: light that is found in this process.
+        strike(monkeypatch, 7, lambda: os.kill(workers_on_this_machine()[0], signal.SIGKILL))
         pipeline.shade(copy, SHADE, workers)
         assert all(
             connection.laddr.ip == "127.0.0.1"

@@ -52,7 +52,9 @@ def test_a_refusal_leaves_no_folder_behind(room, tmp_path):
 
 def test_what_usd_says_of_a_failure_is_told_without_its_source(room, tmp_path):
     edit(room, 'over "room" { def "prop" ( references = @./gone.usda@ ) {} }')
-    with pytest.raises(InputRefused, match=r"gone\.usda.*or bring back the file"):
+    with pytest.raises(
+        InputRefused, match=r"gone\.usda: this layer, which .*edits\.usda names.*Bring it back"
+    ):
         packed(room, tmp_path)
     room.asset.edits_layer.write_text('#usda 1.0\nover "room" {')
     with pytest.raises(InputRefused, match=r"edits\.usda:2:.*Correct") as of_layer:

@@ -310,12 +310,15 @@ def outdated_steps(asset: Asset) -> list[str]:
 
 def refuse_missing(asset: Asset, order: int) -> None:
     """InputRefused where the root layer is gone, or one that a step before the one of this order
-    wrote: the asset would not open, whatever is measured."""
+    wrote: the asset would not open, whatever is measured. After the last step that may go without
+    its photographs."""
     stamps = sorted((asset.folder / STATE_FOLDER / "stamps").glob("*.json"))
     before = [read_stamp(path) for path in stamps if path.name.split("-")[0] < str(order)]
     written = {name for stamp in before if stamp for name in stamp.outputs}
-    layers = [asset.root_layer, *(asset.folder / name for name in sorted(written))]
-    for layer in layers:
+    layers = {asset.root_layer, *(asset.folder / name for name in written)}
+    if order > len(ROLES):
+        layers.discard(asset.photographs_layer)
+    for layer in sorted(layers):
         if layer.suffix.startswith(".usd") and not layer.is_file():
             raise InputRefused(
                 f"{layer}: this layer of the asset is missing. Run `usdbrdf convert`, or the step "
