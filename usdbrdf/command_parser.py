@@ -196,14 +196,11 @@ def _argument(said: _Said) -> inspect.Parameter:
         allow_leading_hyphen=any(choice.startswith("-") for choice in field.choices),
         consume_multiple=(1, None) if kind == tuple[Insert, ...] else None,
     )
-    return inspect.Parameter(
-        _key(option),
-        inspect.Parameter.POSITIONAL_ONLY if option.placed else inspect.Parameter.KEYWORD_ONLY,
-        default=inspect.Parameter.empty if field.default is REQUIRED else None,
-        # As wide as what ``read`` makes, and the default: where pydantic is loaded, cyclopts has it
-        # check the values against these.
-        annotation=Annotated[(list[Any] if several else kind) | None, parameter],
-    )
+    default = inspect.Parameter.empty if field.default is REQUIRED else None
+    # As wide as what ``read`` makes, and the default: where pydantic is loaded, cyclopts has it
+    # check the values against these.
+    wide = (list[Any] if several else kind) | None
+    return _parameter(option, default, Annotated[wide, parameter])
 
 
 def _completed(said: _Said) -> inspect.Parameter:
@@ -214,15 +211,14 @@ def _completed(said: _Said) -> inspect.Parameter:
     if get_origin(kind) is tuple or option.joined:
         kind = list[Path] if kind == tuple[Path, ...] else list[str]
     flag = kind is bool
-    return inspect.Parameter(
-        _key(option),
-        inspect.Parameter.POSITIONAL_ONLY if option.placed else inspect.Parameter.KEYWORD_ONLY,
-        default=inspect.Parameter.empty if option.placed else False if flag else None,
-        annotation=Annotated[
-            kind if option.placed or flag else kind | None,
-            Parameter(name=option.names, negative=()),
-        ],
-    )
+    default = inspect.Parameter.empty if option.placed else False if flag else None
+    kind = kind if option.placed or flag else kind | None
+    return _parameter(option, default, Annotated[kind, Parameter(name=option.names, negative=())])
+
+
+def _parameter(option: Option, default: Any, annotation: Any) -> inspect.Parameter:
+    placed = inspect.Parameter.POSITIONAL_ONLY if option.placed else inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(_key(option), placed, default=default, annotation=annotation)
 
 
 def _value(field: OptionField, option: Option, words: list[tuple[int, str]]) -> Any:

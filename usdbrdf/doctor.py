@@ -4,7 +4,6 @@ needs works: not whether it is installed but whether it does its work."""
 from __future__ import annotations
 
 import ctypes.util
-import os
 import platform
 import re
 import shutil
@@ -26,6 +25,7 @@ from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.identity import tasks_identity
 from usdbrdf.job.memory import GIB, machine_bytes, refuse_few_addresses
 from usdbrdf.job.ownership import folder_lock
+from usdbrdf.job.processes import granted_cores
 from usdbrdf.job.stamp import code_version
 from usdbrdf.kernel import mark_of_compiled, num_threads
 
@@ -72,8 +72,7 @@ def _machine() -> Iterator[Finding]:
     yield told("usdbrdf", f"{code_version()}, in {Path(__file__).parent}")
     system = f"{platform.system()} {platform.machine()}"
     yield told("python", f"{platform.python_version()} on {system}")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield told("cores", f"{cores}; kernels run in {num_threads()} threads")
+    yield told("cores", f"{granted_cores()}; kernels run in {num_threads()} threads")
     memory = machine_bytes()
     few = memory < _LEAST_MEMORY
     advice = "; little: choose a larger --texel-size where it does not suffice" if few else ""

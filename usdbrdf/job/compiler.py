@@ -10,12 +10,12 @@ from usdbrdf.errors import EnvironmentFailure
 def refuse_unusable_settings() -> None:
     """EnvironmentFailure where kernels would not be compiled, which then find nothing, or where
     numba does not start."""
-    if _number("NUMBA_DISABLE_JIT"):
+    if number_told("NUMBA_DISABLE_JIT"):
         raise EnvironmentFailure(
             "NUMBA_DISABLE_JIT is set: without compiled code rays hit nothing. Unset it. "
             "[environment.compiler]"
         )
-    threads = _number("NUMBA_NUM_THREADS")
+    threads = number_told("NUMBA_NUM_THREADS")
     if threads is not None and threads < 1:
         raise EnvironmentFailure(
             f"NUMBA_NUM_THREADS is {threads}, and work needs one thread. Unset it, or give the "
@@ -23,8 +23,8 @@ def refuse_unusable_settings() -> None:
         )
 
 
-def _number(name: str) -> int | None:
-    """What numba makes of a variable; None where it takes its own default."""
+def number_told(name: str) -> int | None:
+    """What libraries make of a variable of the environment; None where they take their default."""
     try:
         return int(os.environ[name])
     except (KeyError, ValueError):

@@ -60,9 +60,9 @@ def object_rows(
         if looked is None or at != read:
             read, looked = at, _looked_at(atlas.frames, chosen[at], seen)
         rows[i] |= _pictures(looked, seen, i, where.box[at, i], photographs=photographs, seed=seed)
-        costs = (
-            _evidence(seen, looked, i, seed) if _was_fitted(fits[i], rows[i]["status"]) else None
-        )
+        if not _was_fitted(fits[i], rows[i]["status"]):
+            continue
+        costs = _evidence(seen, looked, i, seed)
         if costs is not None:
             rows[i]["costs"] = {"phis": _PHIS, "psis": _PSIS, "values": costs.round(4).tolist()}
     return rows

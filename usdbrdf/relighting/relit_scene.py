@@ -11,7 +11,6 @@ import numpy as np
 
 from usdbrdf.asset.readers.render_scene import RenderScene, render_scene_from_file, sky_of_picture
 from usdbrdf.errors import InputRefused, UsageError
-from usdbrdf.files.radiance_header import factors_of_hdr
 from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Bool, Double, Float, Int
@@ -97,9 +96,8 @@ def _light_of_file(
     file: Path, up_axis: str, allow: Sequence[Path]
 ) -> tuple[Sequence[Surface], Sequence[Light]]:
     if file.suffix.lower() in SKY_SUFFIXES:
-        radiance = picture_from_file(file)
-        radiance /= factors_of_hdr(file).astype(np.float32)
-        return (), (sky_of_picture(in_working_space(radiance, file), up_axis),)
+        radiance = in_working_space(picture_from_file(file), file)
+        return (), (sky_of_picture(radiance, up_axis),)
     found = _scene_of_others(file, allow)
     if not _emits_light(found):
         raise InputRefused(

@@ -65,20 +65,22 @@ def with_hidden_light(
     name: str,
     surface: TexturedScene,
     lit: Float,
+    filled: Float,
     coverage: CoverageMap,
     environment: Environment,
     seed: int,
     lamps: KnownLamps,
-    start: Float | None = None,
 ) -> Float:
-    """``light_of_hidden``, of which what it changes is kept under ``name``."""
+    """``light_of_hidden`` from ``lit`` (T, 3), what is known of it, on; ``filled`` (T, 3) is L_d as
+    texturing left it. What this changes is kept under ``name``."""
+    lamplit = np.where((coverage.observed | lamps.texel)[:, None], lit, filled)
 
     def compute() -> dict[str, Array]:
-        light = light_of_hidden(surface, lit, coverage, environment, seed, lamps, start)
-        changed = np.flatnonzero((light != lit).any(axis=1))
+        light = light_of_hidden(surface, lamplit, coverage, environment, seed, lamps, lit)
+        changed = np.flatnonzero((light != lamplit).any(axis=1))
         return {"texel": changed, "light": light[changed]}
 
-    found, light = run.checkpoint(name, compute), lit.copy()
+    found, light = run.checkpoint(name, compute), lamplit.copy()
     light[found["texel"]] = found["light"]
     return light
 

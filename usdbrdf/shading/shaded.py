@@ -360,8 +360,7 @@ def _light(
         return light, unseen
     # Hidden surfaces send on the light of these as well; what clips and is no lamp reflects it.
     known = KnownLamps(told | lamps, said, doubt=doubt)
-    lamplit = np.where((coverage.observed | known.texel)[:, None], light.lit, filled)
-    given = lamplit, coverage, environment, seed, known, light.lit
+    given = light.lit, filled, coverage, environment, seed, known
     return replace(light, lit=with_hidden_light(run, "hidden-lit", surface, *given)), unseen
 
 
@@ -383,8 +382,7 @@ def _lit_by_unseen_lamps(
     for number in range(_LAMP_ROUNDS):
         before, shines = unseen.object, np.isin(owner, unseen.object)
         lamps = known._replace(texel=known.texel | shines)
-        lamplit = np.where((coverage.observed | lamps.texel)[:, None], lit, filled)
-        given = lamplit, coverage, environment, seed, lamps, lit
+        given = lit, filled, coverage, environment, seed, lamps
         lit = with_hidden_light(run, f"hidden-{number}", surface, *given)
         asked = lit, coverage, frames, environment, seed, shine
         unseen = estimate_unseen_lamps(run, f"unseen-{number}", surface, *asked)

@@ -13,7 +13,6 @@ import numpy as np
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import WORKING_SPACE, encoding_of_tag, kind_of_encoding, to_working_space
 from usdbrdf.files.images import colour_tag
-from usdbrdf.files.radiance_header import factors_of_hdr
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Double, Float, Long
 from usdbrdf.untrusted.pictures import picture_from_file
@@ -112,7 +111,6 @@ def environment_from_file(picture: Path | None, up_axis: str) -> Environment:
     if picture is None:
         return black_environment()
     image = picture_from_file(picture)
-    image /= factors_of_hdr(picture).astype(np.float32)
     for wrong, what in (
         (~np.isfinite(image), "infinite, NaN or missing, so the light from there is unknown"),
         (image < 0, "negative, which no light is"),

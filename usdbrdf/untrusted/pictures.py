@@ -8,6 +8,7 @@ import numpy as np
 
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import image_size, read_exr, read_radiance
+from usdbrdf.files.radiance_header import factors_of_hdr
 from usdbrdf.model.arrays import Float
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
 
@@ -17,7 +18,8 @@ _sound: set[str] = set()
 
 
 def picture_from_file(path: Path) -> Float:
-    """(H, W, 3) float32 as stored, NaN outside the data window; one channel becomes three.
+    """(H, W, 3) float32 in the primaries that are stored, divided by what a Radiance header states;
+    NaN outside the data window; one channel becomes three.
 
     ImageRefused where it cannot be read whole.
     """
@@ -31,6 +33,7 @@ def picture_from_file(path: Path) -> Float:
 
 
 def read_here(path: Path) -> Float:
-    if len(image_size(path)[2]) == 1:
-        return np.repeat(read_exr(path), 3, axis=2)
-    return read_radiance(path)
+    grey = len(image_size(path)[2]) == 1
+    stored = np.repeat(read_exr(path), 3, axis=2) if grey else read_radiance(path)
+    stored /= factors_of_hdr(path).astype(np.float32)
+    return stored

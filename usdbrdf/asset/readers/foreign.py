@@ -65,13 +65,12 @@ def _stage_of(*given: Any) -> Usd.Stage:
 def _is_as_written(stage: Usd.Stage) -> bool:
     """Whether every file that the stage is made of is one that a step of this version recorded so:
     of another one's we may not know what it means."""
-    files = [Path(layer.realPath) for layer in stage.GetUsedLayers() if not layer.anonymous]
+    layers = [layer for layer in stage.GetUsedLayers() if not layer.anonymous]
+    files = [Path(layer.realPath) for layer in layers]
     folder = next(
         (up for file in files for up in file.parents if (up / STATE_FOLDER).is_dir()), None
     )
-    if folder is None or any(
-        layer.dirty and not layer.anonymous for layer in stage.GetUsedLayers()
-    ):
+    if folder is None or any(layer.dirty for layer in layers):
         return False
     stamps = map(read_stamp, (folder / STATE_FOLDER / "stamps").glob("*.json"))
     known = hashes_in(one for one in stamps if one and one.version == code_version())
