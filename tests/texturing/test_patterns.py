@@ -369,6 +369,19 @@ def test_halves_of_the_frames_agree_on_patterns_and_not_on_noise(floor: World):
     assert 0.7 < apart / explained < 1.3
 
 
+def test_what_pixels_leave_is_no_noise_where_halves_of_the_frames_agree(floor: World):
+    def share(apart: float, compared: float) -> Float:
+        """Of 1 that is explained by 0.5 numbers a pixel, where pixels leave 3."""
+        told = np.tile(np.float32([1, apart, 0.5, 3, 1, compared]), (SIDE * SIDE, 1))
+        return share_that_is_no_noise(floor.texels, told, _footprint(floor))
+
+    # White noise that leaves so much would explain 3 / 0.5 * 0.5; of that 1.1 * 0.05 counts.
+    np.testing.assert_allclose(share(0.05, 1), 1 - 1.1 * 1.1 * 0.05 * 3, rtol=1e-3)
+    # What halves contradict each other on, and what they could not be asked, is noise.
+    assert not share(1.0, 1).any()
+    assert not share(0.05, 0).any()
+
+
 def test_pixels_over_an_edge_are_left_out():
     # A floor in two colours and objects: pixels of the border show both.
     half = SIDE * TEXEL / 2

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from tests.physics.surfaces import Part, World, quad, world_of
+from tests.physics.surfaces import Part, World, world_of
 from tests.scenes import RADIANCE, ROOM, camera_at, look_at, ring_of_poses, room_mesh
 from usdbrdf import kernel
 from usdbrdf.files.frames import FramePixels, read_frame
@@ -18,7 +18,6 @@ from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.exposures import Probes
-from usdbrdf.texturing.footprints import texel_sizes_from_frames
 from usdbrdf.texturing.observe import Observation, samples_from_frames, spread_order
 from usdbrdf.texturing.psquare import quantile
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -213,47 +212,6 @@ def test_the_number_of_threads_changes_no_bit(room: Room, monkeypatch: pytest.Mo
     _observe(room.world, room.frames, one)
     for name, values in many.arrays().items():
         np.testing.assert_array_equal(one.arrays()[name], values)
-
-
-def test_the_texel_size_is_the_pixel_on_the_surface(room: Room):
-    # A camera 2 m over a large floor, looking straight down, focal length 80 pixels: the distance
-    # along a ray is 2 / cos, the pixel there 2 / cos / 80 wide, stretched by 1 / cos once. The
-    # median over the image is 2 / 80 m times the median of cos^-1.5.
-    floor = world_of([quad((-50, -50, 0), (100, 0, 0), (0, 100, 0))])
-    frames = replace(
-        room.frames,
-        image_paths=(Path("none"),),
-        world_from_camera=look_at(np.array([0, -1e-6, 2.0]), np.zeros(3))[None],
-        intrinsics=np.array([[80.0, 80, 40, 30]]),
-        resolution=np.array([[80, 60]], np.int32),
-    )
-    x, y = np.meshgrid((np.arange(80) - 39.5) / 80, (np.arange(60) - 29.5) / 80)
-    expected = 2 / 80 * np.exp(np.log((1 + x**2 + y**2) ** 0.75).mean())
-    found = texel_sizes_from_frames(floor.scene, floor.rays, frames, max_texels=10**9)
-    assert found.pixels.sum() == 80 * 60
-    assert found.of_objects(floor.scene)[0] == pytest.approx(expected, rel=1e-3)
-    # 10^4 m^2 in at most 10^4 texels, of which an atlas uses 70 %: sqrt(1 / 0.7) m.
-    limited = texel_sizes_from_frames(floor.scene, floor.rays, frames, max_texels=10**4)
-    area = 100.0**2 / len(floor.scene.triangles)
-    assert (area / limited.side**2).sum() / 0.7 == pytest.approx(10**4, rel=1e-4)
-
-
-def test_what_no_frame_shows_gets_coarse_texels(room: Room):
-    # The second sheet lies behind the camera.
-    sheets = world_of(
-        [quad((-1, -1, 0), (2, 0, 0), (0, 2, 0)), quad((-1, -1, 4), (2, 0, 0), (0, 2, 0))]
-    )
-    frames = replace(
-        room.frames,
-        image_paths=(Path("none"),),
-        world_from_camera=look_at(np.array([0, -1e-6, 2.0]), np.zeros(3))[None],
-        intrinsics=np.array([[80.0, 80, 40, 30]]),
-        resolution=np.array([[80, 60]], np.int32),
-    )
-    sizes = texel_sizes_from_frames(sheets.scene, sheets.rays, frames, max_texels=10**9)
-    seen, unseen = sizes.of_objects(sheets.scene)
-    assert seen == pytest.approx(2 / 80, rel=0.2)
-    assert unseen == pytest.approx(4 * seen, rel=0.1)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 8, 54, 90, 400, 401])

@@ -139,6 +139,13 @@ def _albedo(
     shines = known & (ratio.mean(axis=1) > clear_of(lamps.doubt))
     num_known, num_shining = (np.bincount(owner[seen], kind, count) for kind in (known, shines))
     lamp = num_shining > lamps.most * num_known
+    # S is sharp, and pixels are not: in the stripes of blinds half of what is no lamp may exceed
+    # it. All of it together does not.
+    sends, receives = (
+        np.bincount(owner[seen], np.where(known, light.mean(axis=1), 0), count)
+        for light in (np.pi * lit / max(1.0, usual), irradiance)
+    )
+    lamp &= sends > clear_of(lamps.doubt) * receives
     for number, is_lamp in lamps.said.items():
         lamp[number] = is_lamp
     # What the sun shines on is as white as anything until it is known.

@@ -8,19 +8,28 @@ from typing import Any
 
 import numpy as np
 
+from usdbrdf.ahead import ahead
 from usdbrdf.asset.layers.task_layers import write_uv_layer
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.properties import UnwrappedObject
 from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.asset.readers.scene import given_corner_uv, read_unwrapped
+from usdbrdf.files.frames import read_frame
 from usdbrdf.geometry.unwrap import TexelSizes, charts_of_scene
+from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.model.arrays import Array
 from usdbrdf.options import TextureOptions
 from usdbrdf.tasks.task import Task
-from usdbrdf.texturing.footprints import texel_sizes_from_frames
 from usdbrdf.texturing.passes import most_texels
+from usdbrdf.texturing.texel_density import (
+    at_most,
+    finer_where_patterned,
+    frames_for_patterns,
+    points_of_patterns,
+    texel_sizes_from_frames,
+)
 from usdbrdf.transport.rays import RayScene
 
 
@@ -64,10 +73,20 @@ def new_charts(maps: AssetMaps, rays: RayScene, options: TextureOptions) -> dict
         sizes = TexelSizes.even(scene, options.texel_size)
     else:
         most = options.max_texels or most_texels(options.memory)
-        sizes = texel_sizes_from_frames(scene, rays, maps.all_frames, most)
+        sizes = at_most(_sizes_by_frames(maps, rays), scene, most)
     given = [given_corner_uv(maps.stage, obj.prim_path) for obj in scene.objects]
     sides = np.array(sizes.of_objects(scene))
     return {**charts_of_scene(scene, given, sizes), "sides": sides}
+
+
+def _sizes_by_frames(maps: AssetMaps, rays: RayScene) -> TexelSizes:
+    scene, frames = maps.scene, maps.all_frames
+    sizes = texel_sizes_from_frames(scene, rays, frames)
+    looked_at = frames_for_patterns(frames)
+    points = points_of_patterns(scene, rays, frames, looked_at)
+    read = ahead(lambda i: (frames.camera(i), read_frame(frames, i)), looked_at)
+    bar = progress(read, total=len(looked_at), label="patterns", unit="frames")
+    return finer_where_patterned(sizes, scene, rays, points, bar, len(frames))
 
 
 def charts_of_lightings(maps: AssetMaps) -> dict[str, Array]:

@@ -1,27 +1,17 @@
-"""What a pixel covers of a surface: surfaces as pixels blur them, textures with the contrast that
-pixels took restored, and the texel size that suits a capture."""
+"""What a pixel covers of a surface: surfaces as pixels blur them, and textures with the contrast
+that pixels took restored."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from scipy import ndimage
 
 from usdbrdf import calibration
-from usdbrdf.errors import InputRefused
-from usdbrdf.geometry.unwrap import TexelSizes
-from usdbrdf.geometry.visible_faces import visible_faces
-from usdbrdf.job.progress import progress
 from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import doubled_areas, face_normals_and_angles
-from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
-from usdbrdf.texturing.samples import MIN_COSINE, Projection, project
-from usdbrdf.transport.rays import RayScene
+from usdbrdf.texturing.samples import Projection, project
 
 # Eight points like a normal distribution of deviation 1: quarters of its probability on two rings.
 _RING = np.pi / 4 * np.arange(8)
@@ -177,49 +167,3 @@ def restored(
     for _ in range(_STEPS):
         found = np.asarray(found + share * (values - blurred(texels, found, kernel)), np.float32)
     return np.where(surrounded[:, None], found, values)
-
-
-_PACKING = calibration.number("texel_size.packing")
-_UNSEEN = calibration.number("texel_size.unseen")
-# Pixels of a frame's width that are looked at.
-_MOST_ACROSS = 1024
-
-
-def texel_sizes_from_frames(
-    scene: Scene, rays: RayScene, frames: Frames, max_texels: int
-) -> TexelSizes:
-    """What the frames show of each triangle: the mean side, by logarithms, of what their pixels
-    cover of it (sqrt of the area). What no frame shows gets coarse texels. All are larger where the
-    surface would need more than ``max_texels`` otherwise.
-
-    Raises InputRefused if no camera ray meets the mesh.
-    """
-    count = len(scene.triangles)
-    normals = face_normals_and_angles(scene.points, scene.triangles)[0]
-    logarithm, pixels = np.zeros(count), np.zeros(count)
-    numbers = progress(range(len(frames)), total=len(frames), label="texel sizes", unit="frames")
-    for camera in map(frames.camera, numbers):
-        small = camera.at_width(min(camera.width, _MOST_ACROSS))
-        face, point = (found.reshape(-1, *found.shape[2:]) for found in visible_faces(rays, small))
-        way, face = (point - camera.eye)[face >= 0], face[face >= 0]
-        distance = np.linalg.norm(way, axis=1)
-        cosine = np.abs((way * normals[face]).sum(axis=1)) / distance
-        size = distance / math.sqrt(camera.intrinsics[0] * camera.intrinsics[1])
-        size /= np.sqrt(np.maximum(cosine, MIN_COSINE))
-        logarithm += np.bincount(face, np.log(size), count)
-        pixels += np.bincount(face, minlength=count)
-    if not pixels.any():
-        raise InputRefused(
-            "no camera ray meets the mesh, so no texel size can be chosen. Check that poses and "
-            "mesh share one frame of reference and unit. [texturing.texel-size]"
-        )
-    of_object = [
-        np.bincount(scene.face_object, values, len(scene.objects)) for values in (logarithm, pixels)
-    ]
-    anywhere = logarithm.sum() / pixels.sum()
-    own = np.where(of_object[1] > 0, of_object[0] / np.maximum(of_object[1], 1), anywhere)
-    coarse = own[scene.face_object] + math.log(_UNSEEN)
-    side = np.exp(np.where(pixels > 0, logarithm / np.maximum(pixels, 1), coarse))
-    area = doubled_areas(scene.points, scene.triangles) / 2
-    side *= math.sqrt(max(1.0, float((area / side**2).sum()) / (_PACKING * max_texels)))
-    return TexelSizes(side.astype(np.float32), pixels.astype(np.float32))

@@ -135,9 +135,10 @@ def _add(
 def steps(
     equations: Equations, part: slice, surface: PatternedSurface, level: Float, seed: int
 ) -> dict[str, Array]:
-    """The step d (n, 3) of the texels of ``part``, of which the equations are; and of each, (n, 5)
+    """The step d (n, 3) of the texels of ``part``, of which the equations are; and of each, (n, 6)
     "told": what it explains of the squares, how much of that both halves of the frames do not
-    agree on, how many numbers were free for it, which squares are left, and how many pixels.
+    agree on, how many numbers were free for it, which squares are left, how many pixels, and
+    whether both halves were asked.
     level (n,): the radiance of which contrasts are a share."""
     texels = surface.texels
     owner, low = surface.object[part], int(texels.pixel[part.start])
@@ -181,6 +182,7 @@ def steps(
         sign[:, 0] * found[:, 3],
         equations.squares - 2 * explained + again,
         equations.pixels,
+        (equal > _LEAST_EQUAL)[:, 0].astype(np.float32),
     ]
     return {"step": step, "told": np.stack(told, axis=-1)}
 
@@ -233,11 +235,16 @@ def _couple(
 
 
 def share_that_is_no_noise(texels: Texels, told: Float, footprint: Float) -> Float:
-    """(T,): of the steps, from what is ``told`` (T, 5) of them and their neighbours; footprint
+    """(T,): of the steps, from what is ``told`` (T, 6) of them and their neighbours; footprint
     (T, 3): what pixels cover, see ``blurred``."""
-    explained, apart, free, left, count = around(texels, told, footprint).T
+    explained, apart, free, left, count = around(texels, told[:, :5], footprint).T
     white = np.maximum(left, 0) / np.maximum(count - free, 0.1 * count + 1e-9) * free
-    noise = _MARGIN * np.maximum(white, apart)
+    # What the pixels leave holds the patterns that are too fine for them: an object that has
+    # patterns at all has those.
+    owner = texels.object_index()
+    both, alone = (np.bincount(owner, told[:, k] * told[:, 5]) for k in (0, 1))
+    alike = np.where(both > 0, np.clip(_MARGIN * alone / np.maximum(both, 1e-12), 0, 1), 1)
+    noise = _MARGIN * np.maximum(white * alike[owner], apart)
     share: Float = np.clip(1 - noise / np.maximum(explained, 1e-12), 0, 1)
     return np.where((explained > 0) & (free > 0), share, 0).astype(np.float32)
 
