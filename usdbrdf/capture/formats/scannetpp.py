@@ -23,7 +23,6 @@ from usdbrdf.capture.formats.named_pictures import (
     warn_of_radiance,
 )
 from usdbrdf.capture.formats.scannet_objects import annotated_objects
-from usdbrdf.capture.reconstructions.shots import rows_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.capture import Scan
@@ -126,9 +125,10 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 def _bad(document: Path) -> set[str]:
     """Names of the photographs of which the dataset says that they are blurred."""
     said: Any = read_json(document) if document.is_file() else {}
-    rows = [row for key in ("frames", "test_frames") for row in rows_of(said, key)]
-    bad = (str(row.get("file_path", "")) for row in rows if row.get("is_bad") is True)
-    return {PurePosixPath(name).name for name in bad}
+    lists = [said.get(key) for key in ("frames", "test_frames")] if isinstance(said, dict) else []
+    rows = [row for rows in lists if isinstance(rows, list) for row in rows]
+    bad = [row for row in rows if isinstance(row, dict) and row.get("is_bad") is True]
+    return {PurePosixPath(str(row.get("file_path", ""))).name for row in bad}
 
 
 def _masks_of(pictures: Pictures, folder: Path, model: str) -> Path:
