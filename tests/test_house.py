@@ -220,6 +220,7 @@ ENGINEERING: dict[str, str] = {
     "_COLUMNS": "convention of a format",
     "_COMMON": "pixels around one",
     "_CORNER": "geometry: a picture's border",
+    "_COUNTED": "convention of a format",
     "_COUNTED_PIXELS": "time",
     "_COUNTS": "convention of a format",
     "_DARK": "numerics",

@@ -388,6 +388,22 @@ def test_a_folder_that_is_not_one_bracket_is_refused(tmp_path, times, said):
         merge_brackets(tmp_path / "stack", tmp_path / "merged")
 
 
+@pytest.mark.parametrize(("key", "what"), [("FNumber", "f-number"), ("Exif:Pho", "ISO speed")])
+def test_what_only_some_photographs_tell_of_their_exposure_is_not_guessed(tmp_path, key, what):
+    """Without an f-number a photograph counted as taken at f/1."""
+    folder = tmp_path / "stack"
+    _folder_of_photographs(folder, 4.0 ** -np.arange(4.0))
+    spec = oiio.ImageInput.open(str(folder / "IMG_2.png")).spec()
+    for name in [a.name for a in spec.extra_attribs if a.name.startswith(key)]:
+        spec.erase_attribute(name)
+    output = oiio.ImageOutput.create(str(folder / "IMG_2.png"))
+    assert output.open(str(folder / "IMG_2.png"), spec)
+    assert output.write_image(np.full((60, 80, 3), 90, np.uint8))
+    assert output.close()
+    with pytest.raises(InputRefused, match=rf"IMG_2.png: its EXIF data tell no {what}, those of"):
+        merge_brackets(folder, tmp_path / "merged")
+
+
 def test_a_lamp_that_clips_in_all_exposures_is_never_unknown(bracket):
     """Although its flicker makes what a channel tells contradict itself."""
     _, codes, response = bracket

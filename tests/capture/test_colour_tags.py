@@ -259,3 +259,25 @@ def test_colours_of_photographs_beyond_rec709_are_known(capture, tmp_path):
     # From Display P3 to Rec.709, SMPTE EG 432-1 and ITU-R BT.709, whose white is the same.
     rec709_from_p3 = [[1.22494, -0.22494, 0], [-0.04206, 1.04206, 0], [-0.01964, -0.07864, 1.09828]]
     np.testing.assert_allclose(found.radiance, linear @ np.transpose(rec709_from_p3), atol=1e-4)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_adobe_rgb_is_known_by_the_exif_data_of_cameras(tmp_path, order):
+    """DCF 2.0: uncalibrated, and R03 in the directory of interoperability; no profile."""
+    entry = struct.pack(f"{order}HHI4s", 1, 2, 4, b"R03\0")
+    for name, extra, known in (("a.jpg", entry, "g22_adobergb_scene"), ("b.jpg", b"", None)):
+        path = tmp_path / name
+        spec = oiio.ImageSpec(8, 8, 3, "uint8")
+        spec.attribute("Exif:ColorSpace", 65535)
+        output = oiio.ImageOutput.create(str(path))
+        assert output.open(str(path), spec)
+        assert output.write_image(np.zeros((8, 8, 3), np.uint8))
+        assert output.close()
+        whole = path.read_bytes()
+        # A segment more, as cameras write several.
+        path.write_bytes(
+            whole[:2] + b"\xff\xe5" + struct.pack(">H", 2 + len(extra)) + extra + whole[2:]
+        )
+        tag = colour_tag(path)
+        assert encoding_of_tag(*tag) == known
+        assert tag[0]

@@ -341,6 +341,16 @@ def test_photographs_that_were_not_placed_are_left_out(tmp_path):
         ),
         ("M_00>", "Yaw>", "its rotations are headings, pitches and rolls"),
         ("<SRSId>2<", "<SRSId>0<", r"its coordinates are longitudes .*\(EPSG:4326"),
+        (
+            "<Photogroup>",
+            "<Photogroup><SRSId>0</SRSId>",
+            r"several coordinate systems \(SRSId 0, 2",
+        ),
+        (
+            "<SRSId>2</SRSId><Photogroups><Photogroup>",
+            "<Photogroups><Photogroup><SRSId>0</SRSId>",
+            r"its coordinates are longitudes .*\(EPSG:4326",
+        ),
         (f">{ENU}<", ">WGS84<", "its coordinates are longitudes and latitudes"),
         ("<Rotation>", "<Rot>", "not valid XML"),
         ("Rotation>", "Rot>", "no photograph with rotation and centre"),

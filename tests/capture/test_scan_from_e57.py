@@ -45,6 +45,7 @@ def _pose(matrix):
 def _write(path, pictures):
     file = libe57.ImageFile(str(path), "w")
     file.extensionsAdd("", libe57.E57_V1_0_URI)
+    file.extensionsAdd("dist", "http://www.libe57.org/E57_LEICA_Camera_Distortion.txt")
     root = file.root()
     root.set("formatName", libe57.StringNode(file, "ASTM E57 3D Imaging Data File"))
     images = libe57.VectorNode(file, True)
@@ -119,6 +120,45 @@ def test_a_sphere_has_x_ahead_and_turns_to_the_left(tmp_path, room):
     pose = record.world_from_camera
     seen = record.lens.project((points - pose[:3, 3]) @ pose[:3, :3], record.intrinsics)
     np.testing.assert_allclose(seen, expected, atol=1e-6)
+
+
+def _bent(room, model, calibrated):
+    """By the extension of Leica, with OpenCV's terms."""
+    terms = dict(
+        zip(("K1", "K2", "K3", "K4", "K5", "K6"), (-0.1, 0.03, 0.0, 0.02, 0.0, 0.0), strict=True)
+    )
+    terms |= {"P1": 0.004, "P2": -0.003}
+    terms |= dict(zip(("FX", "FY", "CX", "CY"), calibrated, strict=True))
+    stated = {f"dist:CV_{name}": value for name, value in terms.items()}
+    sides = {"dist:CV_HEIGHT": HEIGHT, "dist:CV_WIDTH": WIDTH}
+    return [
+        {**picture, "dist:distortion": {"dist:Type": model, **stated, **sides}}
+        for picture in _pinholes(room)
+    ]
+
+
+@pytest.mark.parametrize("off", [(0.0, 0.0), (-0.5, -0.5), (1.5, 2.5)])
+def test_pinholes_that_bend_light_by_the_extension(survey, room, off):
+    """Radial, dividing and tangential terms as cv2.projectPoints has them."""
+    fx, fy, cx, cy = room.intrinsics[0]
+    _write(survey / "scan.e57", _bent(room, "OpenCV", (fx, fy, cx + off[0], cy + off[1])))
+    taken = e57_files.pictures_of_e57(survey / "scan.e57")
+    record = frame_records(taken, pictures_of(survey, OPTIONS), Findings())[0]
+    x, y = 0.31, -0.23
+    r2 = x * x + y * y
+    radial = (1 - 0.1 * r2 + 0.03 * r2**2) / (1 + 0.02 * r2)
+    u = x * radial + 2 * 0.004 * x * y - 0.003 * (r2 + 2 * x * x)
+    v = y * radial + 0.004 * (r2 + 2 * y * y) - 2 * 0.003 * x * y
+    pixel = record.lens.project(np.array([x, -y, -1.0]), record.intrinsics)
+    # A calibration of its own counts from the middle of the first pixel.
+    right, down = (off[0] + 0.5, off[1] + 0.5) if off[0] > 0 else (0.0, 0.0)
+    np.testing.assert_allclose(pixel, [cx + fx * u + right, cy + fy * v + down], atol=1e-9)
+
+
+def test_a_lens_of_another_model_is_told(survey, room):
+    _write(survey / "scan.e57", _bent(room, "Kannala", room.intrinsics[0]))
+    with pytest.raises(InputRefused, match=r"its lens is distorted by a model.*'Kannala'"):
+        read_scan(survey, OPTIONS)
 
 
 def _no_mesh(survey, room):

@@ -138,6 +138,22 @@ def test_cameras_of_a_component_that_was_not_aligned_with_the_others_are_left_ou
     assert any("'6' stands nowhere among the others" in sentence for sentence in scan.warnings)
 
 
+@pytest.mark.parametrize("alone", [True, False])
+def test_cameras_that_name_no_component_are_of_the_only_one(tmp_path, room, alone):
+    """They stood in the coordinates of the chunk, which only components lead out of."""
+    document, sensors, cameras = _chunk(component=True)
+    _sensor(sensors, 0, **_lens(room))
+    if not alone:
+        _child(document.find("chunk/components"), "component", id="6")
+    for i, pose in enumerate(room.opencv):
+        ids = {"id": str(i), "sensor_id": "0"} | ({"component_id": "5"} if i < 9 else {})
+        camera = _child(cameras, "camera", label=f"DSC{i:04d}", **ids)
+        _child(camera, "transform", _text(_in_chunk(pose)))
+    scan = read_scan(_write(tmp_path / "project", document, room), OPTIONS)
+    assert_same(scan, room, poses=room.world_from_camera[: 10 if alone else 9])
+    assert any("it names no component" in said for said in scan.warnings) != alone
+
+
 def test_a_component_says_where_it_stands_before_the_chunk(tmp_path, room):
     document, sensors, cameras = _chunk(component=True)
     _sensor(sensors, 0, **_lens(room))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, write_obj
 from usdbrdf.capture.adapters import choose_adapter, read_scan
-from usdbrdf.capture.reconstructions.opensfm import shots_of
+from usdbrdf.capture.reconstructions.opensfm import beside, shots_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
 
@@ -60,6 +60,24 @@ def test_the_largest_reconstruction_is_the_room(tmp_path, below):
     assert_same(scan, room, names=room.names)
     assert scan.adapter == "opensfm"
     assert any("2 reconstructions" in said for said in scan.warnings)
+    named = read_scan(tmp_path / below / "reconstruction.json", OPTIONS)
+    assert_same(named, room, names=room.names)
+
+
+def test_a_folder_may_be_called_opensfm(tmp_path):
+    """Which alone does not make it a part of OpenDroneMap's."""
+    folder, room = tmp_path / "opensfm", truth()
+    folder.mkdir()
+    _write(folder, room, [_part(room)])
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+
+
+def test_what_lies_above_the_document_of_opendronemap_is_read_with_it(tmp_path):
+    room = truth()
+    _write(tmp_path, room, [_part(room)], below="opensfm")
+    read = beside(tmp_path / "opensfm")
+    assert {tmp_path / "mesh.obj", tmp_path / "images" / "0000.jpg"} <= set(read)
+    assert beside(tmp_path) == []
 
 
 @pytest.mark.parametrize("kind", ["perspective", "fisheye"])

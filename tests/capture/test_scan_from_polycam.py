@@ -53,6 +53,17 @@ def _write(folder, room, *, corrected=True, alignment=ALIGNMENT):
     return whole
 
 
+def test_folders_of_corrected_cameras_may_be_empty(tmp_path):
+    room = truth()
+    whole = _write(tmp_path, room, corrected=False)
+    for name in ("corrected_cameras", "corrected_images"):
+        (tmp_path / "keyframes" / name).mkdir()
+    scan = read_scan(tmp_path, OPTIONS)
+    points = room.points @ whole[:3, :3].T + whole[:3, 3]
+    assert_same(scan, room, points=points, poses=whole @ room.world_from_camera)
+    assert any("no corrected cameras" in sentence for sentence in scan.warnings)
+
+
 def test_corrected_cameras_stand_in_the_frame_of_the_mesh(tmp_path):
     room = truth()
     whole = _write(tmp_path, room)

@@ -198,3 +198,46 @@ def test_a_telephones_video_is_to_be_extracted(scene):
         path.unlink()
     with pytest.raises(InputRefused, match=r"no pictures in iphone/rgb.*\[capture.frames\]"):
         read_scan(scene, OPTIONS)
+
+
+def _write_nerfstudio(folder, room, *, bad=()):
+    """transforms.json as the dataset has it: other axes than the mesh, the last two frames for
+    tests."""
+    axes = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    fx, fy, cx, cy = room.intrinsics[0].tolist()
+    rows = [
+        {
+            "file_path": f"DSC{i:05d}.JPG",
+            "transform_matrix": (axes @ pose).tolist(),
+            "is_bad": i in bad,
+        }
+        for i, pose in enumerate(room.world_from_camera)
+    ]
+    lens = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": WIDTH, "h": HEIGHT}
+    document = {**lens, "camera_model": "PINHOLE", "frames": rows[:-2], "test_frames": rows[-2:]}
+    folder.mkdir(exist_ok=True, parents=True)
+    (folder / "transforms.json").write_text(json.dumps(document))
+
+
+def test_frames_that_are_said_to_be_bad_are_left_out(scene, room):
+    _write_nerfstudio(scene / "dslr" / "nerfstudio", room, bad=(3, 9))
+    scan = read_scan(scene, OPTIONS)
+    assert len(scan.frames) == 8
+    assert not {"DSC00003.JPG", "DSC00009.JPG"} & {path.name for path in scan.frames.image_paths}
+    assert any("2 of 10 frames are left out" in said for said in scan.warnings)
+
+
+def test_a_document_within_a_scene_names_the_scene(scene, room):
+    _write_nerfstudio(scene / "dslr" / "nerfstudio", room)
+    with pytest.raises(InputRefused, match=rf"the scene of ScanNet\+\+ in .*{scene.name}, whose"):
+        read_scan(scene / "dslr" / "nerfstudio", OPTIONS)
+
+
+def test_the_document_alone_has_its_axes_undone_and_its_test_frames(tmp_path, room):
+    _write_nerfstudio(tmp_path, room, bad=(3,))
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / f"DSC{i:05d}.JPG", image)
+    write_ply(tmp_path / "mesh.ply", room.points, room.triangles)
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, room, poses=np.delete(room.world_from_camera, 3, axis=0))
+    assert any("test_frames" in said for said in scan.warnings)

@@ -166,6 +166,34 @@ def test_a_moving_camera_finds_pictures_by_number_in_another_place(tmp_path, roo
     assert scan.counts["poses_without_photograph"] == 1
 
 
+def test_a_camera_with_few_keys_is_where_usd_interpolates_it(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    camera = UsdGeom.Camera.Define(stage, "/room/camera")
+    place, turn = camera.AddTranslateOp(), camera.AddRotateXYZOp()
+    for time, x, turned in ((1, 1.4, 10.0), (6, 2.6, 60.0), (12, 1.5, 130.0)):
+        place.Set(Gf.Vec3d(x, 1 + time / 10, 1.5), time)
+        turn.Set(Gf.Vec3f(72.0, 5.0, turned), time)
+    _set_lens(camera, room.intrinsics[0])
+    stage.Save()
+    poses = [np.array(camera.ComputeLocalToWorldTransform(time)).T for time in range(1, 11)]
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "images" / f"plate.{1 + i:04d}.exr", image)
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room, poses=np.array(poses))
+
+
+def test_cameras_that_a_program_keeps_for_itself_are_no_lost_photographs(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    many_cameras(stage, room)
+    for name in ("persp", "top", "front", "side", "lookdev"):
+        UsdGeom.Camera.Define(stage, f"/views/{name}")
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "images" / f"IMG_{i:03d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room)
+    assert scan.counts["poses_without_photograph"] == 5
+
+
 def test_cameras_of_a_rig_have_pictures_by_their_names_and_numbers(tmp_path, room):
     stage = make_stage(tmp_path / "shot" / "room.usda", room)
     rig = UsdGeom.Xform.Define(stage, "/rig")

@@ -524,12 +524,17 @@ def test_pose_scale_divides_the_stated_factor_out(capture):
         read_scan(capture.folder, IngestOptions(pose_scale=3))
 
 
+_QUARTER = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
 @pytest.mark.fault("C7")
 @pytest.mark.parametrize(
     ("convention", "change"),
     [
         ("OpenCV axes", lambda m: m @ np.diag([1.0, -1, -1, 1])),
         ("camera-from-world matrices", np.linalg.inv),
+        ("beside a mesh turned by 90 degrees about z", lambda m: _QUARTER.T @ m),
+        ("beside a mesh turned by 180 degrees about z", lambda m: _QUARTER @ _QUARTER @ m),
     ],
 )
 def test_the_convention_that_would_hit_is_named(tmp_path, convention, change):

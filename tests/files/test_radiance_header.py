@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from usdbrdf.errors import ImageRefused
 from usdbrdf.files.radiance_header import factors_of_hdr, primaries_of_hdr
 
 END = b"\n\n-Y 1 +X 1\n\x80\x80\x80\x80"
@@ -82,3 +83,14 @@ def test_primaries_are_eight_numbers_of_which_some_is_not_zero(
     file = hdr(tmp_path, b"EXPOSURE=2", *written, b"COLORCORR=1 1 3")
     assert primaries_of_hdr(file) == found
     np.testing.assert_allclose(factors_of_hdr(file), (2, 2, 6))
+
+
+@pytest.mark.parametrize("said", [b"GAMMA=1", b"GAMMA= 1.000000", b"GAMMA=none", b"# GAMMA=2.2"])
+def test_what_is_not_gamma_corrected_is_radiance(tmp_path: Path, said: bytes):
+    assert (factors_of_hdr(hdr(tmp_path, said, b"EXPOSURE=2")) == 2).all()
+
+
+@pytest.mark.parametrize("said", [b"GAMMA=2.2", b"GAMMA=0.4545"])
+def test_what_is_gamma_corrected_is_refused(tmp_path: Path, said: bytes):
+    with pytest.raises(ImageRefused, match=r"states GAMMA=.*no radiance.*\[image.gamma\]"):
+        factors_of_hdr(hdr(tmp_path, said))

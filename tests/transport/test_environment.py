@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
-from usdbrdf.transport.environment import Environment, black_environment, environment_at
+from usdbrdf.transport.environment import (
+    Environment,
+    black_environment,
+    environment_at,
+    unknown_primaries,
+)
 
 
 def _numbered(height: int, width: int) -> np.ndarray:
@@ -71,3 +77,17 @@ def test_nothing_is_read_outside_of_the_picture():
 
 def test_the_black_environment_is_black():
     assert environment_at(black_environment(), 0.0, 0.6, 0.8, 2) == 0
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_primaries_that_are_not_known_are_told(tmp_path, known: bool):
+    path = tmp_path / "sky.exr"
+    spec = oiio.ImageSpec(4, 2, 3, "float")
+    places = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.329) if known else (0.6, *[0.3] * 7)
+    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), places)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    assert output.write_image(np.ones((2, 4, 3), np.float32))
+    assert output.close()
+    said = unknown_primaries(path)
+    assert said == "" if known else "sky.exr: the header says that its primaries" in said

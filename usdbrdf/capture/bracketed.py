@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
@@ -23,7 +23,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.colour import encoding_of_tag, linear_space_of
 from usdbrdf.files.documents import read_json, write_json
-from usdbrdf.files.exif import exif_exposure
+from usdbrdf.files.exif import exif_exposure, told_by_some
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, transparent_of
 from usdbrdf.files.images import colour_tag, is_eight_bit, needs_float, read_radiance, write_exr
 from usdbrdf.files.paths import contained
@@ -278,6 +278,7 @@ def _document_of_folder(folder: Path) -> dict[str, Any]:
             f"{folder}: neither a transforms.json nor two photographs (JPEG, PNG) of one view. "
             "Name the folder of a capture or of a bracket. [brackets.none]"
         )
+    _refuse_unlike(paths)
     exposures = [exif_exposure(path) for path in paths]
     if None not in exposures and len(set(exposures)) < len(paths):
         first = next(p for p, e in zip(paths, exposures, strict=True) if exposures.count(e) > 1)
@@ -287,6 +288,17 @@ def _document_of_folder(folder: Path) -> dict[str, Any]:
             "transforms.json. [brackets.views]"
         )
     return {"frames": [{"brackets": [{"file_path": path.name} for path in paths]}]}
+
+
+def _refuse_unlike(photographs: Sequence[Path]) -> None:
+    """InputRefused where of photographs only some tell what exposures are compared by."""
+    if unlike := told_by_some(photographs):
+        what, telling, silent = unlike
+        raise InputRefused(
+            f"{silent}: its EXIF data tell no {what}, those of {telling.name} do, so they cannot "
+            'be compared. State the "exposure_time" of all in a transforms.json, in seconds at one '
+            "f-number and ISO speed. [brackets.exposure]"
+        )
 
 
 def _brackets(source: Path, document: Any) -> list[Bracket]:
@@ -299,6 +311,9 @@ def _brackets(source: Path, document: Any) -> list[Bracket]:
         _, own = views.setdefault(str(frame.get("transform_matrix")), (frame, []))
         own.extend(images)
     found = [_bracket(source, entry, images) for entry, images in views.values()]
+    photographs = [image for _, images in views.values() for image in images]
+    unstated = [i["file_path"] for i in photographs if i.get("exposure_time") is None]
+    _refuse_unlike([contained(source.parent, name) for name in unstated])
     if not found or all(len(bracket.images) < 2 for bracket in found):
         raise InputRefused(
             f"{source}: no frame has brackets, and no two frames have one transform_matrix. List "

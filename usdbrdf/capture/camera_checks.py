@@ -22,6 +22,7 @@ _MIN_HIT_SHARE = 0.2
 # Times as many rays that another reading of the poses must let hit: of a mesh of a part of what the
 # pictures show, any hits some.
 _CLEARLY_MORE = 1.5
+_LISTED = 3  # readings that are named
 # Of a mesh's vertices within a picture, from which on few hits mean that it is far away.
 _MIN_FRAMED_SHARE, _PROBED_POINTS = 0.8, 1000
 _MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
@@ -54,15 +55,20 @@ def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> floa
         return share
     tried = {name: _hit_share(scene, frames, read) for name, read in CONVENTIONS.items()}
     least = max(_MIN_HIT_SHARE, _CLEARLY_MORE * share)
-    better = [f"{name}: {hit:.0%}" for name, hit in tried.items() if hit >= least]
+    ranked = sorted(tried.items(), key=lambda one: -one[1])
+    best = ranked[0][1]
+    better = [
+        f"{name}: {hit:.0%}" for name, hit in ranked if hit >= max(least, best / _CLEARLY_MORE)
+    ]
     if not better and share > 0 and _framed_share(scene, frames) >= _MIN_FRAMED_SHARE:
         return share
     if better:
-        cure = f"Other readings of the poses would hit: {'; '.join(better)}. Convert the poses"
+        listed = "; ".join(better[:_LISTED])
+        cure = f"Other readings of the poses would hit: {listed}. Convert the poses"
     else:
         cure = (
-            f"No usual convention does clearly better (best {max(tried.values()):.0%}; tried: "
-            f"{'; '.join(tried)}). Check that mesh and poses share frame and unit"
+            f"None of {len(tried)} usual conventions does clearly better (best {best:.0%}). Check "
+            "that mesh and poses share frame and unit"
         )
     raise InputRefused(
         f"{source}: only {share:.0%} of the camera rays hit the mesh (limit "

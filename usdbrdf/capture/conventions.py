@@ -27,6 +27,28 @@ def _transposed(pose: Double) -> Double:
     return turned
 
 
+def _turned(axis: int, quarters: int) -> Callable[[Double], Double]:
+    """Poses turned about y (1) or z (2) by quarters, with the mesh that somebody has turned so."""
+    first, second = (2, 0) if axis == 1 else (0, 1)
+    turn = np.eye(4)
+    for _ in range(quarters):
+        quarter = np.eye(4)
+        quarter[[first, second], [first, second]] = 0
+        quarter[first, second], quarter[second, first] = -1, 1
+        turn = quarter @ turn
+    return lambda pose: np.asarray(turn @ pose, np.float64)
+
+
+def _beside_turned_meshes() -> dict[str, Callable[[Double], Double]]:
+    return {
+        f"beside a mesh turned by {90 * quarters} degrees about {'xyz'[axis]} (turn it back)": (
+            _turned(axis, quarters)
+        )
+        for axis in (2, 1)
+        for quarters in (1, 2, 3)
+    }
+
+
 # Mix-ups of conventions that are tried where the poses do not fit the mesh.
 CONVENTIONS: dict[str, Callable[[Double], Double]] = {
     "OpenCV axes (negate columns 2 and 3)": opengl_from_opencv,
@@ -39,4 +61,5 @@ CONVENTIONS: dict[str, Callable[[Double], Double]] = {
     "z-up poses beside a y-up mesh": lambda m: _Z_UP_FROM_Y_UP.T @ m,
     "upside down beside the mesh, as Meshroom's are (negate its y and z)": lambda m: _FLIP @ m,
     "nerfstudio's axes of 2022 (state applied_transform)": lambda m: OLD_NERFSTUDIO @ m,
+    **_beside_turned_meshes(),
 }

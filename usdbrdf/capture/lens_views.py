@@ -194,7 +194,9 @@ def _pixels_per_unit(face: _Probes) -> Double:
     at the probes inside."""
     across = np.gradient(face.pixels, face.x, axis=1)
     down = np.gradient(face.pixels, face.y, axis=0)
-    a, b = (across**2).sum(axis=-1), (down**2).sum(axis=-1)
-    mixed = (across * down).sum(axis=-1)
-    largest = np.sqrt((a + b) / 2 + np.sqrt(((a - b) / 2) ** 2 + mixed**2))
+    # Far outside the picture a polynomial goes to any number.
+    with np.errstate(over="ignore", invalid="ignore"):
+        a, b = (across**2).sum(axis=-1), (down**2).sum(axis=-1)
+        mixed = (across * down).sum(axis=-1)
+        largest = np.sqrt((a + b) / 2 + np.sqrt(((a - b) / 2) ** 2 + mixed**2))
     return np.asarray(largest[face.inside & np.isfinite(largest)])

@@ -87,6 +87,21 @@ def exif_exposures(paths: Sequence[Path]) -> tuple[list[float] | None, bool]:
     )
 
 
+def told_by_some(paths: Sequence[Path]) -> tuple[str, Path, Path] | None:
+    """What some photographs tell of their exposure and others do not, in words, with one that tells
+    it and one that does not; None where all tell the same, so that ``Settings.light`` compares."""
+    known: dict[Path, Settings] = {}
+    for path in paths:
+        with suppress(ImageRefused):
+            known[path] = exif_settings(path)
+    for name, word in (("number", "f-number"), ("speed", "ISO speed")):
+        telling = [path for path, settings in known.items() if getattr(settings, name) is not None]
+        silent = [path for path in known if path not in telling]
+        if telling and silent:
+            return word, telling[0], silent[0]
+    return None
+
+
 def _first(value: object) -> object:
     return value[0] if isinstance(value, tuple) and value else value
 

@@ -20,6 +20,7 @@ import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
+from usdbrdf.files.camera_colour import space_by_exif
 from usdbrdf.files.channels import colours_of, layers_with_colours
 from usdbrdf.files.paths import readable_size
 from usdbrdf.files.radiance_header import primaries_of_hdr
@@ -156,8 +157,9 @@ def kind_of_colours(path: Path) -> int:
 
 
 def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
-    """What an image's header says of its colour space: that of the ICC profile in it, else another
-    name, "" without one; and x, y of red, green, blue and white, () without these."""
+    """What an image's header says of its colour space: that of the ICC profile in it, else what
+    EXIF data say instead of sRGB, else another name, "" without one; and x, y of red, green, blue
+    and white, () without these."""
     source = open_image(path)
     spec = source.spec()
     # Of Radiance's files OpenImageIO says Rec.709, whatever primaries they state.
@@ -165,6 +167,8 @@ def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
         return "", stated
     # Of JPEG and PNG OpenImageIO says sRGB, whatever profile is in them.
     name = spec.getattribute("ICCProfile:profile_description")
+    if source.format_name() in ("jpeg", "tiff"):
+        name = name or space_by_exif(path, spec.getattribute("Exif:ColorSpace"))
     name, places = name or spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")
     sound = isinstance(places, tuple) and len(places) == 8
     return str(name or ""), tuple(float(place) for place in places) if sound else ()

@@ -26,7 +26,7 @@ from usdbrdf.model.material import (
     with_corner_colours,
 )
 from usdbrdf.options import Insert, RelightOptions
-from usdbrdf.transport.environment import in_working_space
+from usdbrdf.transport.environment import in_working_space, unknown_primaries
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.mesh_files import model_from_file
 from usdbrdf.untrusted.pictures import picture_from_file
@@ -97,6 +97,8 @@ def _light_of_file(
 ) -> tuple[Sequence[Surface], Sequence[Light]]:
     if file.suffix.lower() in SKY_SUFFIXES:
         radiance = in_working_space(picture_from_file(file), file)
+        if unknown := unknown_primaries(file):
+            warn(unknown)
         return (), (sky_of_picture(radiance, up_axis),)
     found = _scene_of_others(file, allow)
     if not _emits_light(found):

@@ -10,10 +10,11 @@ from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.properties import LightFromOutside, colour
 from usdbrdf.files.colour import DATA
 from usdbrdf.files.images import needs_float, write_exr
+from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskRun
 from usdbrdf.options import NO_LIGHT, ShadeOptions
 from usdbrdf.shading.outside import Outside, estimated_outside
-from usdbrdf.transport.environment import environment_from_file
+from usdbrdf.transport.environment import environment_from_file, unknown_primaries
 
 
 def outside_of(
@@ -22,6 +23,8 @@ def outside_of(
     """The light from outside as a file tells it, or the capture; None without any. said: of
     objects, by number, whether they are lamps, where a person says so."""
     if isinstance(options.environment, Path):
+        if unknown := unknown_primaries(options.environment):
+            warn(unknown)
         return Outside.given(environment_from_file(options.environment, up_axis))
     if options.environment == NO_LIGHT:
         return None

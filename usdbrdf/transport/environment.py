@@ -137,6 +137,19 @@ def in_working_space(image: Float, picture: Path) -> Float:
     return np.maximum(to_working_space(image, tag), np.float32(0))
 
 
+def unknown_primaries(picture: Path) -> str:
+    """A sentence for the user where a picture of light states primaries that are not known, for
+    which ``in_working_space`` takes its own; else ""."""
+    name, places = colour_tag(picture)
+    if not places or encoding_of_tag(name, places) is not None:
+        return ""
+    said = ", ".join(f"{place:.4g}" for place in places)
+    return (
+        f"{picture.name}: the header says that its primaries and white are {said}, which are not "
+        f"read here: they pass for {WORKING_SPACE}. Convert the picture. [light.primaries]"
+    )
+
+
 # Radians around the brightest pixel in which a sun lies, and in which the sky beside it is looked
 # at; how much brighter than that its pixels are, and the least share of all light that it sends.
 _REACH, _BESIDE, _BRIGHTER, _LEAST_SHARE = 0.06, 0.12, 10.0, 0.02

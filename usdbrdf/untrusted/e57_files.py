@@ -5,7 +5,7 @@ Pixels stay where they are: an E57 holds JPEG and PNG files whole, and frames ar
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +21,10 @@ from usdbrdf.untrusted.bounds import read_in_child
 _PINHOLE = ("focalLength", "pixelWidth", "pixelHeight", "principalPointX", "principalPointY")
 _SPHERE = ("pixelWidth", "pixelHeight")
 _KINDS = {"pinholeRepresentation": _PINHOLE, "sphericalRepresentation": _SPHERE}
+# The extension of ASTM E2807 by which Leica says that pinholes bend light, in OpenCV's terms.
+_EXTENSION = "E57_LEICA_Camera_Distortion"
+_TERMS = ("K1", "K2", "K3", "P1", "P2", "K4", "K5", "K6")
+_CALIBRATED = ("FX", "FY", "CX", "CY")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +38,10 @@ class StationPicture:
                 in pixels; of a sphere: width and height of a pixel in radians
     resolution  width, height
     world_from_camera  (4, 4), metres; NaN where the file has no pose
+    distortion  of a pinhole that bends light the extension's k1, k2, k3, p1, p2, k4, k5, k6; else
+                ()
+    calibrated  fx, fy, cx, cy in pixels that these go with, () where not all are stated
+    model       what the extension calls its model of the lens
     """
 
     name: str
@@ -41,6 +49,9 @@ class StationPicture:
     numbers: tuple[float, ...]
     resolution: tuple[int, int]
     world_from_camera: Double
+    distortion: tuple[float, ...] = ()
+    calibrated: tuple[float, ...] = ()
+    model: str = ""
 
 
 def pictures_of_e57(path: Path) -> tuple[StationPicture, ...]:
@@ -61,7 +72,10 @@ def read_here(path: Path) -> tuple[StationPicture, ...]:
         file = libe57.ImageFile(str(path), "r")
         root = file.root()
         images = root["images2D"] if root.isDefined("images2D") else []
-        return tuple(_picture(images[i]) for i in range(len(images)))
+        # Names with a prefix that the file does not declare may not even be asked for.
+        declared = range(file.extensionsCount())
+        bent = [file.extensionsPrefix(i) for i in declared if _EXTENSION in file.extensionsUri(i)]
+        return tuple(_picture(images[i], bent) for i in range(len(images)))
     except libe57.E57Exception as error:
         raise InputRefused(
             f"{path}: damaged or no E57 file ({' '.join(str(error).split())[:160]}). Export it "
@@ -69,7 +83,9 @@ def read_here(path: Path) -> tuple[StationPicture, ...]:
         ) from error
 
 
-def _picture(image: Any) -> StationPicture:
+def _picture(image: Any, bent: Sequence[str]) -> StationPicture:
+    """One picture; ``bent`` are the prefixes by which the file declares distorted lenses."""
+    bent = [prefix for prefix in bent if image.isDefined(f"{prefix}:distortion")]
     kinds = [kind for kind in _KINDS if image.isDefined(kind)]
     kind = kinds[0] if kinds else "visualReferenceRepresentation"
     shown = image[kind] if image.isDefined(kind) else None
@@ -84,7 +100,22 @@ def _picture(image: Any) -> StationPicture:
         numbers=tuple(_number(shown, name) for name in _KINDS.get(kind, ())),
         resolution=(_whole(shown, "imageWidth"), _whole(shown, "imageHeight")),
         world_from_camera=pose,
+        **(_distortion(image[f"{bent[0]}:distortion"], bent[0]) if bent else {}),
     )
+
+
+def _distortion(node: Any, prefix: str) -> dict[str, Any]:
+    """The fields of ``StationPicture`` that the extension states."""
+    terms, calibrated = (
+        tuple(_number(node, f"{prefix}:CV_{name}") for name in names)
+        for names in (_TERMS, _CALIBRATED)
+    )
+    said = f"{prefix}:Type"
+    return {
+        "distortion": terms if any(terms) else (),
+        "calibrated": calibrated if min(calibrated) > 0 else (),
+        "model": str(node[said].value()) if node.isDefined(said) else "",
+    }
 
 
 def _number(node: Any, name: str) -> float:

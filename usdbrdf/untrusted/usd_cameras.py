@@ -13,11 +13,12 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.model.arrays import Double
+from usdbrdf.model.arrays import Bool, Double
 from usdbrdf.untrusted.usd_files import check_units, render_scene_of_usd
 
 # Attributes that name the picture behind a camera: USD's own back plates, and Houdini's.
 _PLATES = ("houdini:backgroundimage", "usdBrdf:capture:image")
+_MOST_BETWEEN = 10_000  # times of one camera
 _SHAPE = "verticalAperture"
 _LENS = (
     "focalLength",
@@ -34,6 +35,7 @@ class UsdCamera:
 
     path, label        of the prim, and its display name or its own
     times              (T,) time codes; NaN where nothing changes
+    sampled            (T,) False at whole times between samples, where USD interpolates
     world_from_camera  (T, 4, 4) as composed, column vectors, in the stage's unit; axes may be
                        scaled
     lens               (T, 5) focal length, horizontal and vertical aperture (NaN where it is
@@ -46,6 +48,7 @@ class UsdCamera:
     path: str
     label: str
     times: Double
+    sampled: Bool
     world_from_camera: Double
     lens: Double
     exposure: Double
@@ -95,7 +98,8 @@ def _camera(camera: UsdGeom.Camera) -> UsdCamera:
     named = map(prim.GetAttribute, _names_of_plates(prim))
     first = Usd.TimeCode.EarliestTime()
     plate = next((a for a in named if _is_path(a.Get(first))), None)
-    times = _sample_times(camera, plate)
+    sampled = _sample_times(camera, plate)
+    times = sorted({*sampled, *_times_between(camera, sampled)})
     codes = [Usd.TimeCode(time) for time in times] or [Usd.TimeCode.EarliestTime()]
     said = [name for name in _LENS if name != _SHAPE or prim.GetAttribute(name).IsAuthored()]
     lens = [
@@ -106,6 +110,7 @@ def _camera(camera: UsdGeom.Camera) -> UsdCamera:
         path=str(prim.GetPath()),
         label=prim.GetDisplayName() or prim.GetName(),
         times=np.array(times or [np.nan], np.float64),
+        sampled=np.array([time in sampled for time in times] or [True], np.bool_),
         # Row vectors in USD: transposed they are ours.
         world_from_camera=np.array(
             [np.array(camera.ComputeLocalToWorldTransform(code)).T for code in codes], np.float64
@@ -133,6 +138,21 @@ def _sample_times(camera: UsdGeom.Camera, plate: Any) -> list[float]:
         times |= set(moving.GetTimeSamples() if moving else ())
         prim = prim.GetParent()
     return sorted(times) if len(times) > 1 else []
+
+
+def _times_between(camera: UsdGeom.Camera, sampled: Sequence[float]) -> Sequence[float]:
+    """Whole times between samples that leave some out, as those of animators and of exporters that
+    write no more than they must; none where a matrix is sampled, as nothing between two of these is
+    a pose."""
+    if not sampled or not sampled[-1] - sampled[0] < _MOST_BETWEEN:
+        return ()
+    prim = camera.GetPrim()
+    while prim and not prim.IsPseudoRoot():
+        for op in UsdGeom.Xformable(prim).GetOrderedXformOps() if UsdGeom.Xformable(prim) else ():
+            if op.GetOpType() == UsdGeom.XformOp.TypeTransform and op.GetNumTimeSamples() > 1:
+                return ()
+        prim = prim.GetParent()
+    return range(math.ceil(sampled[0]), math.floor(sampled[-1]) + 1)
 
 
 def _file_of(plate: Usd.Attribute, code: Usd.TimeCode) -> str:

@@ -31,6 +31,8 @@ from usdbrdf.untrusted.e57_files import StationPicture, pictures_of_e57
 
 NAME = "e57"
 DESCRIPTION = DESCRIPTIONS[NAME]
+# Pixels between principal points that are one: from the corner, or the middle of the first pixel.
+_COUNTED = 0.51
 # Our camera (x right, y up, looking down -z) in the frame of a sphere (x ahead, y left, z up).
 _FLIP = np.array([[0.0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
@@ -85,6 +87,8 @@ def frame_records(
         found = _camera(each)
         if found is None:
             why = f"a {each.kind} picture, or one without pose and size, cannot be projected"
+            if each.distortion and not _is_opencv(each):
+                why = f"its lens is distorted by a model that is not read ({each.model[:40]!r})"
             findings.drop(each.name, why, "capture.camera")
             continue
         image = pictures.named(each.name) if each.name else None
@@ -114,7 +118,30 @@ def _camera(each: StationPicture) -> tuple[Lens, tuple[float, float, float, floa
         return None
     if each.kind == "pinhole":
         focal, across, down, cx, cy = each.numbers
-        return PINHOLE, (focal / across, focal / down, cx, cy), pose
+        intrinsics = focal / across, focal / down, cx, cy
+        if not each.distortion:
+            return PINHOLE, intrinsics, pose
+        return (_bent_lens(each), _calibrated(each, intrinsics), pose) if _is_opencv(each) else None
     across, down = each.numbers
     lens = Lens(curve="equirectangular")
     return lens, (1 / across, 1 / down, width / 2, height / 2), pose @ _FLIP
+
+
+def _is_opencv(each: StationPicture) -> bool:
+    return each.model.lower().replace(" ", "") in ("", "opencv")
+
+
+def _bent_lens(each: StationPicture) -> Lens:
+    k1, k2, k3, p1, p2, *divisor = each.distortion
+    return Lens(radial=(k1, k2, k3), tangential=(p1, p2), divisor=tuple(divisor))
+
+
+def _calibrated(
+    each: StationPicture, stated: tuple[float, float, float, float]
+) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy that the distortion goes with: those of the pinhole, unless the calibration
+    beside it has others by more than its pixels may be counted differently."""
+    if not each.calibrated or np.abs(np.subtract(each.calibrated, stated)).max() <= _COUNTED:
+        return stated
+    fx, fy, cx, cy = each.calibrated
+    return fx, fy, cx + 0.5, cy + 0.5  # OpenCV's, from the middle of the first pixel

@@ -156,7 +156,10 @@ def frame_records(
             continue
         place = place_of(camera)
         if place is None:
-            said = f"its component {camera.get('component_id')!r} stands nowhere among the others"
+            named = camera.get("component_id")
+            said = f"its component {named!r} stands nowhere among the others"
+            if named is None:
+                said = "it names no component, of which there are several"
             findings.drop(label, said, "capture.alignment")
             continue
         image = picture_of.get(camera)
@@ -245,6 +248,11 @@ def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Eleme
         component = camera.get("component_id", "")
         if place := components.get(component) or own:
             return place
+        if component not in components and is_placed:
+            # Cameras that name no component are of the only one, if there is but one.
+            return (
+                next(iter(components.values())) if len(components) == 1 and not component else None
+            )
         alone = not is_placed and component in (largest, "")
         return _UNPLACED if alone or component not in components else None
 

@@ -38,6 +38,8 @@ from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 FILE = "dataparser_transforms.json"
 # What its exporters call their meshes, but for mesh.obj, which anybody's may be called.
 EXPORTED = ("poisson_mesh.ply", "tsdf_mesh.ply", "sdf_marching_cubes_mesh.ply")
+# Folders of a scene of ScanNet++, which hold nerfstudio/.
+_OF_SCANNETPP = ("dslr", "iphone")
 # What COLMAP calls its meshes, and where its models lie that documents were made of, instant-ngp's
 # first.
 _COLMAPS = ("meshed-poisson.ply", "meshed-delaunay.ply")
@@ -75,6 +77,13 @@ class Applied:
         found = pose.copy()
         found[:3, 3] /= self.scale
         return np.asarray(np.linalg.inv(self.matrix) @ found, np.float64)
+
+
+def scene_above(document: Path) -> Path | None:
+    """The folder of the scene of ScanNet++ that a document is a part of, None of any other."""
+    scene = document.parents[min(2, len(document.parents) - 1)]
+    apart = document.parent.name == "nerfstudio" and document.parent.parent.name in _OF_SCANNETPP
+    return scene if apart and (scene / "scans").is_dir() else None
 
 
 def stated_pose(matrix: object) -> Double | None:

@@ -7,7 +7,7 @@ of that of undistorted photographs the lens alone is read.
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
@@ -45,6 +45,7 @@ _PICTURES = {
     },
     "iphone/colmap": {"iphone/rgb": "iphone/rgb_masks"},
 }
+_SAID = "nerfstudio/transforms.json"
 _UNDISTORTED = "nerfstudio/transforms_undistorted.json"
 
 
@@ -73,9 +74,13 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     masks = _masks_of(pictures, folder, chosen)
     model, records = colmap_model(source), []
     lenses = _lenses(pictures, source, model.cameras)
+    bad = _bad(source.parent / _SAID)
     for name, number, pose in zip(
         model.names, model.camera_of_image.tolist(), model.camera_from_world, strict=True
     ):
+        if PurePosixPath(name).name in bad:
+            findings.count("frames_said_to_be_bad", 1)
+            continue
         image = pictures.named(name)
         if image is None:
             drop_without_picture(name, findings)
@@ -92,6 +97,11 @@ def read(path: Path, options: CaptureOptions) -> Scan:
                 lens=lens,
                 mask_path=mask if mask.is_file() else None,
             )
+        )
+    if left := findings.counts.get("frames_said_to_be_bad"):
+        findings.warn(
+            f"{source.parent.name}: {left} of {len(model.names)} frames are left out, of which "
+            f"{_SAID} says is_bad. [capture.image]"
         )
     warn_of_radiance(pictures.instead, findings, source)
     records.sort(key=lambda record: record.image_path)
@@ -110,6 +120,15 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         name=folder.name,
         objects=annotated_objects(scans / "segments.json", scans / "segments_anno.json"),
     )
+
+
+def _bad(document: Path) -> set[str]:
+    """Names of the photographs of which the dataset says that they are blurred."""
+    said: Any = read_json(document) if document.is_file() else {}
+    lists = [said.get(key) for key in ("frames", "test_frames")] if isinstance(said, dict) else []
+    rows = [row for rows in lists if isinstance(rows, list) for row in rows]
+    bad = [row for row in rows if isinstance(row, dict) and row.get("is_bad") is True]
+    return {PurePosixPath(str(row.get("file_path", ""))).name for row in bad}
 
 
 def _masks_of(pictures: Pictures, folder: Path, model: str) -> Path:

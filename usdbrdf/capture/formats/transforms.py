@@ -23,6 +23,7 @@ from usdbrdf.capture.formats.nerfstudio_frames import (
     old_axes_by_model,
     rigid_matrix,
     rolling_shutter,
+    scene_above,
     stated_pose,
     statements_beside,
 )
@@ -45,6 +46,8 @@ NAME = "transforms"
 DESCRIPTION = DESCRIPTIONS[NAME]
 # Folder of the reconstruction that old documents were made of.
 _COLMAP = "colmap/sparse/0"
+# ScanNet++'s keys for the frames it tests with, and of one that is blurred.
+_TESTED, _BAD = "test_frames", "is_bad"
 # No number in a document means anything beyond this; nor, where it must be positive, below its
 # inverse.
 _LARGEST = 1e15
@@ -208,10 +211,18 @@ def _captured(
     source: Path, options: CaptureOptions, findings: Findings, *, images: bool = True
 ) -> tuple[_Capture, list[FrameRecord]]:
     """The document and its frames, but for those without pose or file."""
+    if (scene := scene_above(source)) is not None:
+        raise InputRefused(
+            f"{source}: belongs to the scene of ScanNet++ in {scene}, whose mesh has other axes "
+            "than its poses. Name that folder. [capture.format]"
+        )
     # A camera that could not be placed costs its frame, not the capture.
     document = read_json(source, nonfinite_below=("transform_matrix",))
     frames = document.get("frames") if isinstance(document, dict) else None
-    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+    # ScanNet++ keeps those that it tests with, and says which are blurred.
+    tested = document.get(_TESTED, []) if isinstance(frames, list) else None
+    frames = [*frames, *tested] if isinstance(frames, list) and isinstance(tested, list) else None
+    if frames is None or not all(isinstance(frame, dict) for frame in frames):
         if said := other_program(source):
             raise InputRefused(f"{source}: {said}. [capture.format]")
         raise InputRefused(
@@ -222,10 +233,17 @@ def _captured(
         said := other_program(source)
     ):
         raise InputRefused(f"{source}: {said}. [capture.format]")
-    unsaid = "applied_transform" not in document and (source.parent / _COLMAP).is_dir()
-    known = old_axes_by_model(source.parent / _COLMAP, frames) if unsaid else False
+    beside = (source.parent / _COLMAP).is_dir()
+    unsaid = "applied_transform" not in document and (beside or _TESTED in document)
+    if unsaid and _TESTED in document:
+        findings.warn(
+            f"{source.name}: has {_TESTED}, as ScanNet++'s documents have, so its axes, which are "
+            "not those of its mesh, are undone; state applied_transform if the mesh has them. "
+            "[capture.legacy]"
+        )
+    known = old_axes_by_model(source.parent / _COLMAP, frames) if beside and unsaid else unsaid
     legacy = known is None or known
-    if legacy:
+    if legacy and beside:
         how = "are" if known else "are taken for"
         doubt = "" if known else "; state applied_transform if they are not"
         findings.warn(
@@ -246,8 +264,14 @@ def _captured(
             f"{source.name}: states a rolling_shutter, which is not undone: what a camera took "
             "while it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
         )
-    numbered = enumerate(frames)
-    records = [r for i, frame in numbered if (r := _record(capture, frame, i, findings))]
+    sound = [(i, frame) for i, frame in enumerate(frames) if frame.get(_BAD) is not True]
+    if len(sound) < len(frames):
+        findings.count("frames_said_to_be_bad", len(frames) - len(sound))
+        findings.warn(
+            f"{source.name}: {len(frames) - len(sound)} of {len(frames)} frames are left out, of "
+            f"which it says {_BAD}. [capture.image]"
+        )
+    records = [r for i, frame in sound if (r := _record(capture, frame, i, findings))]
     capture.pictured.warn_of_others(findings, source)
     return capture, records
 

@@ -58,6 +58,11 @@ class _Shot(NamedTuple):
         return float(self.camera.times[self.i])
 
     @property
+    def sampled(self) -> bool:
+        """False at times between the samples of what moves."""
+        return bool(self.camera.sampled[self.i])
+
+    @property
     def name(self) -> str:
         path = self.camera.path
         return path if math.isnan(self.time) else f"{path} at {self.time:g}"
@@ -127,8 +132,13 @@ def _records(
                 f"of {len(shots)} cameras, first {shots[0].name}. Name each picture as its camera, "
                 "or end its name with the number of the camera's time sample. [capture.frames]"
             )
+    others = _others(
+        {shot.camera.path for shot, _ in named}, {s.camera.path for s, p in named if p}
+    )
     for shot, image in named:
-        if image is None and (by_plate or not math.isnan(shot.time)):
+        if not shot.sampled and (image is None or not image.is_file()):
+            continue
+        if image is None and (by_plate or shot.camera.path in others or not math.isnan(shot.time)):
             # Other cameras, and animation that runs on between the pictures that were kept.
             findings.count("poses_without_photograph", 1)
         elif image is None:
@@ -137,6 +147,20 @@ def _records(
             findings.drop(shot.name, "the image file does not exist", "capture.file")
         else:
             yield from _record(shot, image, findings)
+
+
+def _others(cameras: set[str], pictured: set[str]) -> set[str]:
+    """The cameras that are none of the photographs': below another prim than all that have a
+    picture, as the views that programs keep for themselves are."""
+    beside = Counter(path.rpartition("/")[0] for path in cameras)
+
+    def place(path: str) -> str:
+        above = path.rpartition("/")[0]
+        # Where each camera has a prim of its own, what holds these.
+        return above if beside[above] > 1 else above.rpartition("/")[0]
+
+    places = {place(path) for path in pictured}
+    return {path for path in cameras - pictured if place(path) not in places}
 
 
 def _by_name(shots: list[_Shot], pictures: Pictures) -> list[tuple[_Shot, Path | None]]:

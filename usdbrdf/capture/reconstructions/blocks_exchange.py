@@ -77,8 +77,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     (source,) = documents
     root = read_xml(source)
     block = _block(root, source, findings)
-    systems = {_text(row, "Id"): _text(row, "Definition") for row in root.iter("SRS")}
-    system = systems.get(_text(block, "SRSId"), "")
+    system = _system(root, block, source)
     if any(abs(_aspect(group) - 1) > _UNEVEN for group in block.iter("Photogroup")):
         findings.warn(
             f"{source.name}: pixels that are not square; AspectRatio is taken for the focal length "
@@ -136,6 +135,19 @@ def _block(root: Element, source: Path, findings: Findings) -> Element:
             f"has most poses, {max(posed)}. [capture.format]"
         )
     return chosen
+
+
+def _system(root: Element, block: Element, source: Path) -> str:
+    """The definition of the block's coordinate system, which some state with each group instead;
+    "" where it is stated nowhere. InputRefused where groups have several."""
+    known = {_text(row, "Id"): _text(row, "Definition") for row in root.iter("SRS")}
+    stated = {_text(each, "SRSId") for each in (block, *block.iter("Photogroup"))} - {""}
+    if len(stated) > 1:
+        raise InputRefused(
+            f"{source}: its photographs are in several coordinate systems (SRSId "
+            f"{', '.join(sorted(stated))[:40]}). Export the block in one. [capture.unit]"
+        )
+    return known.get(next(iter(stated), ""), "")
 
 
 def _is_global(system: str) -> bool:

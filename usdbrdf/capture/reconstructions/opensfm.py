@@ -14,7 +14,14 @@ from scipy.spatial.transform import Rotation
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import rigid_pose
-from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, scan_of_shots, size_in
+from usdbrdf.capture.reconstructions.shots import (
+    Shot,
+    ShotCamera,
+    capture_folder_of,
+    files_of_capture,
+    scan_of_shots,
+    size_in,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.tables import numbers_among
@@ -27,6 +34,7 @@ NAME = "opensfm"
 DESCRIPTION = DESCRIPTIONS[NAME]
 # Where it lies in a project of OpenSfM, and in one of OpenDroneMap.
 _PLACES = ("reconstruction.json", "opensfm/reconstruction.json")
+_MESHES = ("mesh.*", "odm_texturing/odm_textured_model.obj", "odm_meshing/odm_mesh.ply")
 _SPHERES = ("spherical", "equirectangular")
 # Radial terms of each projection. Tangential and prism terms are 0 where it has none.
 _COUNTS = {
@@ -50,7 +58,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     source, findings = _document(path.resolve()), Findings()
     if source is None:
         raise InputRefused(f"{path}: no {_PLACES[0]}. Name its folder. [capture.format]")
-    folder = source.parent.parent if source.parent.name == "opensfm" else source.parent
+    folder = _home(source)
     document: Any = read_json(source)
     parts = [p for p in document if _listed(p)] if isinstance(document, list) else []
     if not parts:
@@ -71,11 +79,29 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         adapter=NAME,
         source=source,
         folder=folder,
-        meshes=("mesh.*", "odm_texturing/odm_textured_model.obj", "odm_meshing/odm_mesh.ply"),
+        meshes=_MESHES,
         how="Put a mesh in the frame of the reconstruction, which georeferenced ones do not have, "
         "into this folder",
         in_metres=_knows_its_place(largest),
     )
+
+
+def beside(path: Path) -> list[Path]:
+    """What OpenDroneMap's folder holds above the one of the document, where that is named."""
+    source = _document(path.resolve())
+    home = capture_folder_of(path) if source is None else _home(source)
+    return [] if home == capture_folder_of(path) else files_of_capture(home, meshes=_MESHES)
+
+
+def _home(source: Path) -> Path:
+    """The capture's folder: OpenDroneMap's, which has the pictures beside opensfm/, or its own,
+    whatever that is called."""
+    above = source.parent.parent
+    of_drone_map = source.parent.name == "opensfm" and (
+        (above / "images").is_dir() or any(above.glob("odm_*"))
+    )
+    own = (source.parent / "images").is_dir()
+    return above if of_drone_map and not own else source.parent
 
 
 def _knows_its_place(part: dict[str, Any]) -> bool:

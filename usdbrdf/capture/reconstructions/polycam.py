@@ -41,7 +41,8 @@ def matches(path: Path) -> bool:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     folder, findings = path.resolve(), Findings()
-    whole = [kind for kind in _KEYFRAMES if all((folder / name).is_dir() for name in kind)]
+    # Some exports have the folders of corrected ones, with nothing in them.
+    whole = [kind for kind in _KEYFRAMES if all(_holds_any(folder / name) for name in kind)]
     if not whole:
         raise InputRefused(
             f"{folder}: no keyframes/cameras with keyframes/images. Export 'Raw Data' from Polycam "
@@ -71,6 +72,10 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         # What the corrected ones show of no picture, black by up to some ten pixels.
         rim=whole[0] is _KEYFRAMES[0],
     )
+
+
+def _holds_any(folder: Path) -> bool:
+    return folder.is_dir() and any(folder.iterdir())
 
 
 def _alignment(path: Path, findings: Findings) -> Double:
