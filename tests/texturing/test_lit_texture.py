@@ -26,7 +26,7 @@ def _measured(count, clipped, median=None, bound=None) -> Measured:
     return Measured(
         median=np.where(np.asarray(count)[:, None] > 0, level, np.nan),
         mean=np.where(np.asarray(count)[:, None] > 0, 3 * level, np.nan),
-        spread=np.where(np.asarray(count)[:, None] > 0, 0.25, np.nan).astype(np.float32),
+        spread=np.where(np.asarray(count)[:, None] > 0, [0.25] * 3, np.nan).astype(np.float32),
         count=np.asarray(count, np.int32),
         clipped=np.asarray(clipped, np.int32),
         lower_bound=np.zeros(number, np.float32) if bound is None else bound,
@@ -43,7 +43,7 @@ def test_what_was_measured_stays_and_the_rest_takes_after_it(trio: World):
     np.testing.assert_allclose(found.mean[:OWN], 3 * median[:OWN], rtol=1e-5)
     np.testing.assert_allclose(found.lit[2 * OWN :], median[2 * OWN :], rtol=1e-5)
     assert found.samples.tolist() == count.tolist()
-    assert found.spread.tolist() == np.where(count > 0, 0.25, 0).tolist()
+    np.testing.assert_array_equal(found.spread, np.where(count[:, None] > 0, [0.25] * 3, 0))
     assert found.coverage.measured.tolist() == (count > 0).tolist()
     assert not found.coverage.clipped.any()
     assert found.contradicting == {"a": 2}
