@@ -221,7 +221,7 @@ def test_the_flat_stretch_reaches_as_far_as_costs_stay_within_a_hundredth():
     assert stretch(1.0, 1.009, 1.005, 3, 3, 3, 3) == (0.0, 0.1, 0.2)
     assert stretch(*[1.0] * 7) == (0.0, 0.3, 0.6)
     # In any order of asking.
-    assert _flat_interval({0.5: 1.0, 0.1: 4.0, 0.3: 1.005}) == (0.3, 0.3, 0.5)
+    assert _flat_interval({0.5: 1.0, 0.125: 4.0, 0.25: 1.005}) == (0.25, 0.25, 0.5)
 
 
 def test_pixels_weigh_by_their_radiance_and_a_floor():
