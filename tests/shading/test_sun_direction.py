@@ -115,7 +115,7 @@ def test_the_true_direction_costs_nothing_at_the_true_strength(strength):
 def test_only_what_is_more_than_chance_is_better():
     before = np.array([1.0, 2, 3, 4] * 25)
     gain = np.where(np.arange(100) % 2, 1.0, -0.4)  # mean 0.3, deviation 0.7
-    assert _is_better(before - gain, before) == (0.3 > sun_direction._SURE * 0.07)
+    assert _is_better(before - gain, before) == (sun_direction._SURE * 0.07 < 0.3)
     assert not _is_better(before - 0.5 * (gain - 0.1), before)
     assert _is_better(before - gain - 0.1, before)
     assert not _is_better(before + gain + 0.1, before)

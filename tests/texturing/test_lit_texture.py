@@ -38,7 +38,9 @@ def test_what_was_measured_stays_and_the_rest_takes_after_it(trio: World):
     count = np.zeros(3 * OWN, int)
     count[:OWN:2], count[2 * OWN] = 5, 1
     median = np.where(np.arange(3 * OWN)[:, None] < OWN, [0.1, 0.2, 0.4], [7.0, 8, 9])
-    found = _filled_in(trio.texels, _measured(count, 0 * count, median.astype(np.float32)), {"a": 2})
+    found = _filled_in(
+        trio.texels, _measured(count, 0 * count, median.astype(np.float32)), {"a": 2}
+    )
     np.testing.assert_allclose(found.lit[:OWN], median[:OWN], rtol=1e-5)
     np.testing.assert_allclose(found.mean[:OWN], 3 * median[:OWN], rtol=1e-5)
     np.testing.assert_allclose(found.lit[2 * OWN :], median[2 * OWN :], rtol=1e-5)

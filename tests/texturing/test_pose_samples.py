@@ -18,6 +18,7 @@ from usdbrdf.transport.rays import RayScene
 
 WIDTH, HEIGHT, PATCH = 60, 44, 8
 LENS = np.array([50.0, 46.0, 29.0, 23.5])
+NO_STEP = np.zeros(6)
 
 
 def _pixels(radiance, valid) -> FramePixels:
@@ -65,7 +66,7 @@ def _wall(extent: float = 9.0) -> RayScene:
     return RayScene(np.concatenate([corners, screen]).astype(np.float32), triangles)
 
 
-def _camera(steps=np.zeros(6)) -> Camera:
+def _camera(steps=NO_STEP) -> Camera:
     """About 3 before the wall and askew, after ``steps``: turned and moved in its own axes."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("xyz", (0.2, -0.15, 0.4)).as_matrix()
