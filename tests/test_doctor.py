@@ -100,3 +100,40 @@ def test_a_library_that_is_missing_is_broken(told, monkeypatch):
     status, found = told()
     assert status == 4
     assert found["libraries"]["text"].startswith("xatlas: not installed.")
+
+
+@pytest.mark.parametrize(
+    ("version", "asked", "within"),
+    [
+        ("2.0", ">=2.0,<3", True), ("2", "<3,>=2.0", True), ("2.4.1", ">=2,<3", True),
+        ("1.26.4", ">=2.0,<3", False), ("3.0", ">=2.0,<3", False), ("10.1", ">=9.2,<11", True),
+        ("2.0.0rc1", ">=2.0,<3", True), ("2023.12.post3", ">=2023.12,<2027", True),
+        ("0.0.8", ">=0.0.9,<0.1", False), ("7", "", True),
+    ],
+)  # fmt: skip
+def test_a_version_lies_between_its_bounds(version, asked, within):
+    assert doctor._is_within(version, asked) is within
+
+
+def test_other_versions_than_those_asked_for_are_told(told, monkeypatch):
+    known = Message()
+    known["Provides-Extra"] = "report"
+    for line in (
+        "numpy<3,>=2.0", "numba>=0.61", "scipy (>=1.13,<2)",
+        "matplotlib<4,>=3.9; extra == 'report'", "moto[s3]>=5; extra == 'report'",
+    ):  # fmt: skip
+        known["Requires-Dist"] = line
+    versions = {"numpy": "2.2", "scipy": "1.14", "matplotlib": "3.8.4", "moto": "5.0"}
+    monkeypatch.setattr(doctor, "_metadata_of_all", lambda: known)
+    monkeypatch.setattr(doctor, "_version", lambda name: versions.get(name, "1"))
+    status, found = told()
+    assert status == 0
+    assert found["report"]["state"] == "broken"
+    assert found["report"]["text"] == (
+        "matplotlib is 3.8.4, not <4,>=3.9: pip install 'usdbrdf[report]'"
+    )
+    versions["scipy"] = "2.1"
+    status, found = told()
+    assert status == 4
+    assert found["libraries"]["state"] == "broken"
+    assert found["libraries"]["text"].startswith("scipy is 2.1, not >=1.13,<2. Install")

@@ -117,6 +117,8 @@ def _required_packages() -> str:
     absent = [name for name in _packages_of("") if _version(name) is None]
     if absent:
         raise EnvironmentFailure(f"{', '.join(absent)}: not installed. Install usdbrdf again.")
+    if others := _of_other_versions(""):
+        raise EnvironmentFailure(f"{_asked(others)}. Install usdbrdf again, or these alone.")
     known = ("numpy", "numba", "usd-core", "openimageio", "embreex")
     return ", ".join(f"{name} {_version(name)}" for name in known)
 
@@ -159,13 +161,12 @@ def _extras() -> Iterator[Finding]:
         found = {name: _version(name) for name in _packages_of(extra)}
         absent = [name for name, version in found.items() if version is None]
         here = ", ".join(f"{name} {version}" for name, version in found.items() if version)
+        others = [] if absent else _of_other_versions(extra)
         cure = f"pip install 'usdbrdf[{extra}]'"
-        yield Finding(
-            part="extra",
-            name=extra,
-            state="missing" if absent else "ok",
-            text=f"{', '.join(absent)} not installed: {cure}" if absent else here,
-        )
+        state: State = "missing" if absent else "broken" if others else "ok"
+        text = f"{', '.join(absent)} not installed: {cure}" if absent else here
+        text = f"{_asked(others)}: {cure}" if others else text
+        yield Finding(part="extra", name=extra, state=state, text=text)
 
 
 def _programs() -> Iterator[Finding]:
@@ -207,14 +208,44 @@ def _metadata_of_all() -> metadata.PackageMetadata:
 
 def _packages_of(extra: str) -> list[str]:
     """Names of what an extra requires on this Python; of "" what every run does."""
+    return [name for name, _ in _requirements_of(extra)]
+
+
+def _of_other_versions(extra: str) -> list[tuple[str, str]]:
+    """Names and versions asked for of those whose installed version is another."""
+    return [
+        (name, asked)
+        for name, asked in _requirements_of(extra)
+        if (version := _version(name)) is not None and not _is_within(version, asked)
+    ]
+
+
+def _asked(others: list[tuple[str, str]]) -> str:
+    return ", ".join(f"{name} is {_version(name)}, not {asked}" for name, asked in others)
+
+
+def _is_within(version: str, asked: str) -> bool:
+    """Whether a version lies between the bounds, ">=1.2,<3": of those we ask for no others."""
+
+    def number(text: str) -> list[int]:
+        release = re.match(r"\d+(?:\.\d+)*", text)
+        parts = [int(part) for part in release[0].split(".")] if release else [0]
+        return parts + [0] * (8 - len(parts))
+
+    bounds = re.findall(r"(>=|<)\s*([\w.]+)", asked)
+    return all((number(version) >= number(bound)) == (sign == ">=") for sign, bound in bounds)
+
+
+def _requirements_of(extra: str) -> list[tuple[str, str]]:
+    """Names of the same, and the versions that are asked for."""
     found = []
     for line in _metadata_of_all().get_all("Requires-Dist") or ():
-        name = re.match(r"[\w.-]+", line)
+        name = re.match(r"([\w.-]+)(?:\[[^]]*\])?\s*\(?([^;)]*)", line)
         own = re.search(r"extra == ['\"]([\w-]+)['\"]", line)
         below = re.search(r"python_version < ['\"]3\.(\d+)['\"]", line)
         here = below is None or sys.version_info[1] < int(below[1])
         if name and here and (own[1] if own else "") == extra:
-            found.append(name[0])
+            found.append((name[1], name[2].strip()))
     return found
 
 

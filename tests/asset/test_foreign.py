@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,10 @@ import pytest
 from pxr import Gf, Sdf, Vt
 
 from usdbrdf.asset.header import read_provenance
+from usdbrdf.asset.layers.interface import NEEDS, needs_too
+from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_edited, open_measured, open_stage
+from usdbrdf.asset.readers.foreign import refuses_foreign
 from usdbrdf.asset.readers.scene import (
     frames_from_stage,
     hashes_of_photographs,
@@ -220,3 +224,38 @@ def test_a_layer_that_one_may_not_read_is_no_damage(room, monkeypatch):
     finally:
         monkeypatch.undo()
         room.edits_layer.write_text(sound)
+
+
+def test_a_reader_for_which_there_is_no_thread_blames_no_layer(room):
+    @refuses_foreign("nothing")
+    def read(stage):
+        raise RuntimeError("can't start new thread")
+
+    with pytest.raises(EnvironmentFailure, match=r"\[environment\.processes\]$"):
+        read(open_measured(room))
+
+
+@pytest.mark.parametrize("edit", ["gone", "no prim", "text", "numbers", "broken"])
+def test_an_interface_that_was_edited_by_hand_is_named(room, tmp_path, edit):
+    """And adopted: a later step adds to what it says."""
+    folder = tmp_path / "room"
+    shutil.copytree(room.folder, folder)
+    asset = Asset.made(folder)
+    file = asset.interface("scan")
+    layer = Sdf.Layer.OpenAsAnonymous(str(file))
+    path = layer.rootPrims[0].path
+    told = {"text": "x", "numbers": Vt.IntArray([1, 2])}
+    if edit in told:
+        layer.rootPrims[0].SetInfo("assetInfo", {NEEDS: told[edit]})
+    elif edit == "no prim":
+        layer = Sdf.Layer.CreateAnonymous()
+    layer.Export(str(file))
+    if edit == "gone":
+        file.unlink()
+    elif edit == "broken":
+        file.write_text("#usda 1.0\ndef {")
+    own = Sdf.Layer.CreateAnonymous()  # a prim lives as long as its layer
+    root = Sdf.CreatePrimInLayer(own, path)
+    with pytest.raises(InputRefused, match=rf"^{re.escape(str(file))}: .*\[stage\.content\]$"):
+        needs_too(root, asset, [Path("a.usdc")])
+    assert not root.HasInfo("assetInfo")

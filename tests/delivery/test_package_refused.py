@@ -175,3 +175,12 @@ def test_names_that_are_not_ascii_are_packed(tmp_path):
     made = tmp_path / "room.usdz"
     write_usdz(made, tmp_path, ["room.usda", "Stühle.png"])
     assert Sdf.ZipFile.Open(str(made)).GetFileNames() == ["room.usda", "Stühle.png"]
+
+
+@pytest.mark.parametrize(("name", "profile"), [("room.usdz", "default"), ("room.usdz", "arkit"),
+                                               ("room.glb", "default")])  # fmt: skip
+def test_an_asset_whose_objects_are_all_set_aside_is_no_package(room, tmp_path, name, profile):
+    edit(room, 'over "room" { over "geo" ( active = false ) {} }')
+    with pytest.raises(InputRefused, match=r"edits\.usda sets aside\. \[package\.empty\]$"):
+        packed(room, tmp_path, name, profile=profile)
+    assert not (tmp_path / "out of it").exists()

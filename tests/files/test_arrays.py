@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import zipfile
 
 import numpy as np
 import pytest
 
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.documents import load_arrays, save_arrays
 from usdbrdf.files.tables import read_array
 
@@ -61,3 +62,27 @@ def test_a_header_that_lies_is_refused_in_one_line(tmp_path, header):
             read(tmp_path / name)
         assert "\n" not in str(refused.value)
         assert str(refused.value).endswith("[arrays.damaged]")
+
+
+def test_what_the_machine_lacks_is_no_damage(tmp_path, monkeypatch):
+    """A thread, an open file, a disk that answers: not to be made again by exporting anything."""
+    path = tmp_path / "a.npz"
+    save_arrays(path, {"x": np.arange(500)})
+    np.save(tmp_path / "a.npy", np.arange(5))
+    for error, rule in (
+        (RuntimeError("can't start new thread"), "environment.processes"),
+        (OSError(errno.EMFILE, "Too many open files"), "environment.io"),
+        (OSError(errno.EIO, "Input/output error"), "environment.io"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "environment.memory"),
+    ):
+
+        def failing(*_, error=error, **__):
+            raise error
+
+        with monkeypatch.context() as patched:
+            patched.setattr(np.lib.format, "read_magic", failing)
+            patched.setattr(np, "load", failing)
+            for read in (lambda: load_arrays(path), lambda: read_array(tmp_path / "a.npy")):
+                with pytest.raises(EnvironmentFailure, match=rf"\[{rule}\]$"):
+                    read()
+    assert load_arrays(path)["x"][7] == 7

@@ -12,6 +12,8 @@ import pytest
 from usdbrdf.material.fit_target import (
     FrameSamples,
     GridFit,
+    _explained,
+    _flat_interval,
     fit_grid,
     fit_metal,
     multiple_of,
@@ -201,3 +203,54 @@ def test_a_metal_comes_back_in_each_channel(phi):
     # Brighter than any mirror: no reflectance is above 1.
     assert max(fit_metal(4 * observed, weight, basis).f0) == 1
     assert fit_metal(0 * observed, weight, basis).f0 == (0, 0, 0)
+
+
+def test_the_flat_stretch_reaches_as_far_as_costs_stay_within_a_hundredth():
+    """To both sides of the least, to the ends of all, and no farther than the first that is more;
+    its middle is the tried roughness that lies nearest, of two the lower."""
+    phis = [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+
+    def stretch(*costs: float):
+        return _flat_interval(dict(zip(phis, costs, strict=True)))
+
+    assert stretch(1.0, 2, 1.005, 1.0, 1.009, 2, 1) == (0, 0, 0)
+    assert stretch(1.2, 2, 1.005, 1.0, 1.009, 2, 0.9) == (0.6, 0.6, 0.6)
+    assert stretch(3, 2, 1.005, 1.0, 1.009, 2, 3) == (0.2, 0.3, 0.4)
+    assert stretch(3, 2, 1.015, 1.0, 1.009, 1.011, 3) == (0.3, 0.3, 0.4)
+    assert stretch(3, 3, 3, 3, 1.009, 1.005, 1.0) == (0.4, 0.5, 0.6)
+    assert stretch(1.0, 1.009, 1.005, 3, 3, 3, 3) == (0.0, 0.1, 0.2)
+    assert stretch(*[1.0] * 7) == (0.0, 0.3, 0.6)
+    # In any order of asking.
+    assert _flat_interval({0.5: 1.0, 0.125: 4.0, 0.25: 1.005}) == (0.25, 0.25, 0.5)
+
+
+def test_pixels_weigh_by_their_radiance_and_a_floor():
+    """The inverse of its square, a tenth of the median added."""
+    diffuse = np.array([[0.0, 0, 0], [0.5, 1, 1.5], [3, 3, 3]], np.float32)
+    samples = FrameSamples(diffuse, diffuse, np.ones(3), lambda *_: None)
+    np.testing.assert_allclose(
+        samples.weight(), [[1 / 0.1**2], [1 / 1.1**2], [1 / 3.1**2]], rtol=1e-5
+    )
+    black = FrameSamples(0 * diffuse, 0 * diffuse, np.ones(3), lambda *_: None)
+    # Of a thing that reflects nothing each pixel tells as much.
+    weight = black.weight()
+    assert np.isfinite(weight).all()
+    assert (weight == weight[0]).all()
+    assert weight[0] > 0
+
+
+def test_what_is_explained_is_a_share_of_the_squares():
+    target = np.array([[1.0, 2, 2]])
+    assert _explained(0.0, target) == 1
+    assert _explained(3.0, target) == pytest.approx(1 - 3 / 9)
+    assert _explained(18.0, target) == 0
+    assert _explained(0.0, 0 * target) == 0
+
+
+def test_a_cost_is_of_each_residual_and_no_metal_explains_black():
+    _, basis = _scene()
+    base, slope = basis(0.3)
+    off = np.random.default_rng(3).normal(0, 0.01, base.shape).astype(np.float32)
+    found = fit_metal(base + 10 * slope + off, np.full((PIXELS, 1), 4, np.float32), basis)
+    assert found.cost == pytest.approx(4 * 0.01**2, rel=0.1)
+    assert found.f0 == pytest.approx((0.8, 0.8, 0.8), abs=0.01)

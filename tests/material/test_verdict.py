@@ -17,6 +17,10 @@ from usdbrdf.material.verdict import (
     SOME_EVIDENCE,
     UNASKED,
     LobeEstimate,
+    _deviation,
+    _quantiles,
+    _vertex,
+    least_costs,
     lobe_from_costs,
     verdict_on_frame,
     verdict_on_metal,
@@ -196,3 +200,42 @@ def test_one_frame_is_sure_of_nothing_of_a_metal():
     many, one = (verdict_on_metal(0.2, f0, 1e-3, error) for error in (1e-3, math.nan))
     assert (many.status, many.phi_confidence, many.psi_confidence) == ("measured", "high", "high")
     assert (one.status, one.phi_confidence, one.psi_confidence) == ("prior", "low", "low")
+
+
+def test_the_least_cost_lies_at_the_vertex_of_a_parabola():
+    """Of roughnesses that are unevenly far from each other, of any scale of the cost."""
+    phis = np.array([0.0, 0.1, 0.25, 0.3, 0.6, 1.0])
+    for vertex in (0.12, 0.2, 0.28, 0.33, 0.52):
+        assert _vertex(phis, 4 + 7 * (phis - vertex) ** 2) == pytest.approx(vertex)
+    # None at either end, nor where neighbours do not rise.
+    assert _vertex(phis, 1 + phis) == 0
+    assert _vertex(phis, 2 - phis) == 1
+    assert _vertex(phis, np.ones(6)) == 0
+    assert _vertex(phis, np.array([3.0, 1, 1, 1, 2, 3])) == pytest.approx(0.175, abs=0.076)
+    # Never beyond a neighbour.
+    steep = np.array([1e6, 1.0, 1.0 + 1e-9, 2, 3, 4])
+    assert 0.1 <= _vertex(phis, steep) <= 0.25
+
+
+def test_quantiles_are_of_the_middle_of_what_each_value_stands_for():
+    values = np.array([0.0, 1, 2, 3])
+    even = np.full(4, 0.25)
+    assert _quantiles(even, values, (0.5, 0.125, 0.875)) == pytest.approx((1.5, 0, 3))
+    assert _quantiles(np.array([0, 0, 1.0, 0]), values, (0.5,)) == pytest.approx((2,))
+    assert _quantiles(np.array([0.5, 0, 0, 0.5]), values, (0.05, 0.95)) == pytest.approx((0, 3))
+
+
+def test_a_deviation_is_about_what_is_asked():
+    density, values = np.array([0.25, 0.5, 0.25]), np.array([0.2, 0.4, 0.6])
+    assert _deviation(density, values, 0.4) == pytest.approx(0.2 / math.sqrt(2))
+    assert _deviation(density, values, 0.5) == pytest.approx(math.sqrt(0.02 + 0.01))
+
+
+def test_psi_of_the_least_cost_is_the_ratio_of_its_terms_between_none_and_all():
+    # c0, c1, c2 of c0 - 2 psi c1 + psi^2 c2.
+    terms = np.array([[5.0, 1.0, 4.0], [5.0, 6.0, 4.0], [5.0, -1.0, 4.0], [5.0, 0.0, 0.0]])
+    psi, cost, square = least_costs(terms, 5.0)
+    assert psi.tolist() == [0.25, 1, 0, 0]
+    assert cost == pytest.approx([5 - 0.25, 5 - 12 + 4, 5, 5])
+    assert square == pytest.approx([4, 4, 4, 5e-12])
+    assert least_costs(terms, 0.1)[2][3] == pytest.approx(1e-12)

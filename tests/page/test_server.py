@@ -7,6 +7,7 @@ import json
 import socket
 import struct
 import threading
+import time
 from urllib.parse import urlsplit
 
 import pytest
@@ -154,3 +155,36 @@ def test_view_says_where_it_is_and_ends_with_an_interrupt(built, monkeypatch, ca
     told = capsys.readouterr().err
     assert told.startswith("http://127.0.0.1:")
     assert opened == ([told.split(": open")[0]] if browser else [])
+
+
+@pytest.mark.parametrize("path", ["review", "elsewhere"])
+def test_what_is_too_long_to_take_is_answered_and_not_cut_off(server, built, path):
+    """Who sends it all before listening, as browsers and libraries do, hears why."""
+    there = urlsplit(server.address).path + path
+    body = b"{" + b" " * (24 << 20)
+    kind = {"Content-Type": "application/json"}
+    wanted = (413, b"too long") if path == "review" else (404, b"nothing here")
+    for _ in range(3):
+        assert asked(server, "POST", there, body, **kind) == wanted
+    assert not review_file(built.asset).exists()
+
+
+def test_who_goes_on_sending_is_not_listened_to_for_ever(server, monkeypatch):
+    monkeypatch.setattr(server_module, "_LINGER", 0.2)
+    place = urlsplit(server.address)
+    with socket.create_connection((place.hostname, place.port), timeout=200) as connection:
+        connection.sendall(
+            f"POST {place.path}review HTTP/1.1\r\nHost: {place.netloc}\r\n"
+            "Content-Type: application/json\r\nContent-Length: 9999999\r\n\r\n{}".encode()
+        )
+        with connection.makefile("rb") as answer:
+            assert answer.readline().startswith(b"HTTP/1.0 413 ")
+            assert answer.read().endswith(b"too long")
+
+        def send_on():
+            for _ in range(1000):
+                connection.sendall(b" " * 1000)
+                time.sleep(0.01)
+
+        with pytest.raises(ConnectionError):
+            send_on()

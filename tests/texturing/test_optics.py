@@ -5,15 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.scenes import make_capture
+from tests.scenes import camera_at, make_capture
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.scene import frames_from_stage
-from usdbrdf.files.frames import read_frame
+from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import read_radiance, write_exr
 from usdbrdf.options import IngestOptions
 from usdbrdf.pipeline import ingest
-from usdbrdf.texturing.optics import Samples, balance_drift, falloff_of_frames
+from usdbrdf.texturing.agreement import MeshPoints
+from usdbrdf.texturing.optics import (
+    Samples,
+    _without_means,
+    balance_drift,
+    falloff_of_frames,
+    samples_in_frame,
+    squared_radius,
+)
+from usdbrdf.transport.rays import RayScene
 
 # An f/1.8 lens wide open: 1.3 stops in the corners.
 K1, K2 = -0.5, -0.4
@@ -105,3 +114,60 @@ def test_a_frame_of_another_balance_is_one_of_the_warnings(tmp_path):
     assert "of 1 of 16 frames" in warning
     assert capture.image(4).name in warning
     assert warning.endswith("[capture.balance]")
+
+
+def test_radius_is_one_in_the_corners_of_a_centred_picture():
+    lens = (50.0, 50.0, 32.0, 24.0)
+    column, row = np.array([-0.5, 63.5, 31.5, 31.5]), np.array([-0.5, 47.5, 23.5, 47.5])
+    found = squared_radius(lens, 64, 48, column, row)
+    np.testing.assert_allclose(found, [1, 1, 0, 24**2 / (32**2 + 24**2)], atol=1e-12)
+    off = squared_radius((50.0, 50.0, 30.0, 20.0), 64, 48, np.array([63]), np.array([4]))
+    np.testing.assert_allclose(off, 4 * (33.5**2 + 15.5**2) / (64**2 + 48**2))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_what_rows_and_columns_share_is_taken_off_by_weight(weighted: bool):
+    rng = np.random.default_rng(2)
+    shared = rng.normal(0, 1, (30, 1)) + rng.normal(0, 1, (1, 8))
+    weight = rng.uniform(0.5, 2, (30, 8)) if weighted else np.ones((30, 8))
+    weight[3, 2], weight[5] = 0, 0  # one that is unknown, and a point that no frame shows
+    own = rng.normal(0, 0.1, (30, 8))
+    left = _without_means(shared + own, weight)
+    assert np.abs((weight * left).sum(axis=0)).max() < 1e-9
+    assert np.abs((weight * left).sum(axis=1)).max() < 1e-3
+    again = _without_means(own, weight)
+    np.testing.assert_allclose(left[weight > 0], again[weight > 0], atol=1e-3)
+
+
+def test_what_a_frame_shows_of_a_point_is_the_mean_around_it():
+    """Of a wall at z = 0 with a radiance that is a plane over the picture, one pixel unknown and
+    one of another channel black."""
+    points = np.float32([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
+    rays = RayScene(points, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+    pose = np.eye(4)
+    pose[2, 3] = 2.0
+    lens = np.array([40.0, 40.0, 30.0, 21.0])
+    camera = camera_at(pose, lens, 60, 44)
+    place = np.array([(10.4, 12.2), (40.7, 30.1), (25.5, 8.5), (50.2, 40.3)])
+    point = np.stack([(place[:, 0] - 30) / 20, (21 - place[:, 1]) / 20, np.zeros(4)], axis=-1)
+    surface = MeshPoints(point, np.tile([0.0, 0, 1], (4, 1)), np.zeros(4, np.int32))
+    row, column = np.mgrid[:44, :60]
+    level = 3 + 0.02 * column - 0.03 * row
+    radiance = np.stack([level, 2 * level, 3 * level], axis=-1).astype(np.float32)
+    valid, none = np.ones((44, 60), bool), np.zeros((44, 60), bool)
+    valid[29, 41] = False
+    radiance[7, 24, 2] = 0
+    pixels = FramePixels(
+        radiance=radiance, valid=valid, clipped=none, dark=none, unknown=none, transparent=none,
+        num_clamped=0,
+    )  # fmt: skip
+    found, radius2 = samples_in_frame(surface, rays, camera, pixels)
+    cell = np.floor(place)
+    shown = 3 + 0.02 * cell[:, 0] - 0.03 * cell[:, 1]
+    wanted = np.log(shown[:, None] * [1, 2, 3])
+    np.testing.assert_allclose(found[[0, 3]], wanted[[0, 3]], rtol=1e-5)
+    assert np.isnan(found[[1, 2]]).all()
+    off = ((cell + 0.5 - [30, 21]) ** 2).sum(axis=1)
+    np.testing.assert_allclose(radius2, 4 * off / (60**2 + 44**2), rtol=1e-6)
+    behind, _ = samples_in_frame(surface._replace(normal=-surface.normal), rays, camera, pixels)
+    assert np.isnan(behind).all()

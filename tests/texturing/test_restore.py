@@ -165,3 +165,45 @@ def test_a_view_along_the_surface_has_a_finite_footprint(floor: World):
     found = footprints(floor.texels, which, camera_at(pose, LENS, 80, 60))
     assert np.isfinite(found).all()
     assert np.isfinite(widest(found)).all()
+
+
+@pytest.fixture(scope="module")
+def halves() -> World:
+    """A square in two charts with the diagonal between them, no texel wide."""
+    made = quad((0, 0, 0), (1, 0, 0), (0, 1, 0), (24, 24))
+    apart = made.uv.copy()
+    apart[0] = apart[0] * 0.86 + [0.11, 0.02]
+    apart[1] = apart[1] * 0.86 + [0.02, 0.11]
+    return world_of([replace(made, uv=apart)])
+
+
+@pytest.mark.parametrize("covariance", [(2.0, 0, 2.0), (6.0, 4.0, 3.0), (0.5, -0.3, 9.0)])
+def test_nothing_of_another_chart_is_blurred_into_one(halves: World, covariance):
+    texels = halves.texels
+    values = np.where(texels.face == 0, 1.0, 5.0).astype(np.float32)[:, None]
+    found = blurred(texels, values, _footprint(halves, *covariance))
+    assert len(np.unique(texels.face)) == 2
+    np.testing.assert_allclose(found, values, rtol=1e-6)
+
+
+def test_what_lies_off_a_chart_counts_as_the_texel_itself(halves: World):
+    """So means are no less than its share on the chart, and no more of a rim than of the middle."""
+    texels = halves.texels
+    x, y = (texels.pixel % 24).astype(np.float32), (texels.pixel // 24).astype(np.float32)
+    values = np.stack([x, y], axis=-1)
+    found = blurred(texels, values, _footprint(halves, 1.0, 0, 1.0))
+    off = np.abs(found - values).max(axis=1)
+    # A slope stays a slope inside; at a rim means are drawn inwards, by less than a ring's radius.
+    assert (off < 1.3 * np.sqrt(1 + 1 / 12)).all()
+    assert np.median(off) < 1e-4
+    assert off.max() > 0.2
+
+
+@pytest.mark.parametrize("size", [(1, 12), (12, 1), (1, 1)])
+def test_rows_and_columns_of_texels_are_blurred_along_themselves(size: tuple[int, int]):
+    world = world_of([quad((0, 0, 0), (1, 0, 0), (0, 1, 0), size)])
+    place = np.arange(len(world.texels), dtype=np.float32)[:, None]
+    plain = blurred(world.texels, np.ones_like(place), _footprint(world, 4.0, 1.0, 4.0))
+    np.testing.assert_allclose(plain, 1, rtol=1e-6)
+    found = blurred(world.texels, place, _footprint(world, 1.0, 0, 1.0))
+    np.testing.assert_allclose(found[4:-4], place[4:-4], atol=1e-4)

@@ -283,6 +283,12 @@ def write_package(
     glb = output.suffix.lower() == GLB
     stage = stage_in_look(asset, options.look)
     flat = flattened(stage, asset, with_lights=not glb and options.profile != ARKIT)
+    shapes = UsdGeom.Gprim, UsdGeom.PointInstancer
+    if not any(prim.IsA(shape) for prim in flat.Traverse() for shape in shapes):
+        raise InputRefused(
+            f"{asset.folder}: no object of the asset is left to pack. Look at what edits.usda sets "
+            "aside. [package.empty]"
+        )
     with environment_failures(str(output)), folders_above(output), scratch_folder(output) as made:
         reduced: dict[str, int] = {}
         if options.low_poly is not None:

@@ -287,6 +287,14 @@ def failure_of_machine(error: Exception) -> EnvironmentFailure | None:
     return _failure(str(_place_of(error) or "this machine"), error)
 
 
+def shortage(error: BaseException) -> EnvironmentFailure | None:
+    """``failure_of_machine`` where no file that was being read can be to blame, whatever reader
+    stumbled: threads, open files, memory, a disk that fails. Permission is the file's."""
+    if not isinstance(error, Exception) or isinstance(error, PermissionError):
+        return None
+    return failure_of_machine(error)
+
+
 def _place_of(error: OSError) -> object:
     """Which file an error is about; of one that is temporary, and gone when the message is read,
     what it was to become, or else the folder that it was in."""

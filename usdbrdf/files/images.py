@@ -19,7 +19,13 @@ import numpy as np
 import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
-from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
+from usdbrdf.files.atomic import (
+    environment_failures,
+    publish,
+    sha256_of,
+    shortage,
+    temporary_beside,
+)
 from usdbrdf.files.camera_colour import space_by_exif
 from usdbrdf.files.channels import colours_of, layers_with_colours
 from usdbrdf.files.paths import readable_size
@@ -371,6 +377,8 @@ def _decoding(path: Path, decoder: Any, problem: str, rule: str, making: int = 0
     try:
         yield
     except Exception as error:
+        if (failure := shortage(error)) is not None:
+            raise failure from error
         said = _message(decoder)
         scarce = isinstance(error, MemoryError) or (making and _WANT_OF_MEMORY.search(said))
         try:

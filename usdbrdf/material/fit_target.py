@@ -263,7 +263,8 @@ class FrameSamples(NamedTuple):
         """(P, 1), of squared residuals: errors of L_d and of the frame grow with the radiance; the
         floor keeps the noise of dark pixels small."""
         level = self.diffuse.mean(axis=1, keepdims=True)
-        floor = max(0.1 * float(np.median(level)), 1e-30)
+        # Its square is a number in single precision too.
+        floor = max(0.1 * float(np.median(level)), 1e-15)
         return np.asarray(1 / (level + floor) ** 2, np.float32)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import secrets
+import socket
 import sys
 import threading
 import time
@@ -29,7 +30,11 @@ from usdbrdf.page.report import page, page_data, reviewed
 
 _HOST = "127.0.0.1"
 _LARGEST_REVIEW = 4 << 20  # bytes
+_BLOCK = 1 << 16
 _LENGTH = re.compile("[0-9]{1,7}")  # of a review
+# Of what is not taken so many bytes are read all the same, for so many seconds: a connection that
+# is closed over unread ones is reset, and the answer with it.
+_READ_AWAY, _LINGER = 64 << 20, 5.0
 _PAUSE = 0.2  # seconds until the next try where no more connections can be had
 
 
@@ -58,6 +63,7 @@ class PageServer:
         class Handler(BaseHTTPRequestHandler):
             server_version, sys_version = "usdbrdf", ""
             timeout = 60
+            unread = False  # whether something of a request may not have been read
 
             def do_GET(self) -> None:
                 if self._refused(at_page):
@@ -71,6 +77,7 @@ class PageServer:
                     self._answer(200, page.encode("utf-8"), "text/html; charset=utf-8")
 
             def do_POST(self) -> None:
+                self.unread = True
                 if self._refused(at_review):
                     return
                 origin = self.headers.get("Origin")
@@ -83,7 +90,24 @@ class PageServer:
                 elif len(content := self.rfile.read(int(length))) < int(length):
                     self._answer(400, b"cut off")
                 else:
+                    self.unread = False
                     self._take(content)
+
+            def finish(self) -> None:
+                with suppress(OSError):
+                    if self.unread:
+                        self.wfile.flush()
+                        self.connection.shutdown(socket.SHUT_WR)
+                        self._read_away()
+                super().finish()
+
+            def _read_away(self) -> None:
+                end, left = time.monotonic() + _LINGER, _READ_AWAY
+                while left > 0 and (seconds := end - time.monotonic()) > 0:
+                    self.connection.settimeout(seconds)
+                    if not (read := len(self.rfile.read1(_BLOCK))):
+                        return
+                    left -= read
 
             def _take(self, content: bytes) -> None:
                 try:

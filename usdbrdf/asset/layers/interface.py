@@ -10,11 +10,12 @@ compose from the layers of the tasks, the artist's edits included: no fact lies 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom
 
 from usdbrdf.asset.header import (
     LAYOUT,
@@ -27,6 +28,7 @@ from usdbrdf.asset.header import (
 )
 from usdbrdf.asset.layers.author import apply_schema, attribute, define, export, over
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
+from usdbrdf.errors import InputRefused
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.capture import Scan
@@ -197,10 +199,26 @@ def write_scan_interface(
 
 def needs_too(root: Sdf.PrimSpec, asset: Asset, layers: Sequence[Path]) -> None:
     """Beside what the interface of the scan tells of, the payload opens these."""
-    interface = Sdf.Layer.OpenAsAnonymous(str(asset.interface("scan")))
-    known = interface.GetPrimAtPath(root.path).GetInfo("assetInfo").get(NEEDS, [])
-    needs = [*known, *(Sdf.AssetPath(f"./{layer.name}") for layer in layers)]
+    needs = [
+        *_told_of(asset.interface("scan"), root.path),
+        *(Sdf.AssetPath(f"./{layer.name}") for layer in layers),
+    ]
     root.SetInfo("assetInfo", {NEEDS: Sdf.AssetPathArray(needs)})
+
+
+def _told_of(interface: Path, path: Sdf.Path) -> list[Sdf.AssetPath]:
+    """What the payload of a prim opens, as its interface tells; that may have been edited by hand,
+    and adopted."""
+    with suppress(Tf.ErrorException, AttributeError, TypeError):
+        prim = Sdf.Layer.OpenAsAnonymous(str(interface)).GetPrimAtPath(path)
+        known = prim.GetInfo("assetInfo").get(NEEDS, [])
+        if all(isinstance(each, Sdf.AssetPath) for each in known):
+            return list(known)
+    raise InputRefused(
+        f"{interface}: it does not say of <{path}> which layers it needs, as usdbrdf writes it "
+        "there. Take the file from a copy of the asset, or run `usdbrdf convert` again with "
+        "--discard. [stage.content]"
+    )
 
 
 def _author_model(
