@@ -455,6 +455,12 @@ def test_message_about_a_strange_name_is_printable(tmp_path, capsys):
     assert "\x1b" not in capsys.readouterr().err
 
 
+@pytest.mark.fault("S4")
+def test_message_about_a_name_with_newlines_is_one_line(tmp_path, capsys):
+    main(["ingest", str(tmp_path / "no\nne"), "-o", str(tmp_path / "out")])
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_version_and_plugin_path(capsys):
     assert main(["--version"]) == 0
     assert re.fullmatch(r"usdbrdf \S+\n", capsys.readouterr().out)

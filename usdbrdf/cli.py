@@ -11,7 +11,14 @@ from collections.abc import Sequence
 
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.job.interrupts import Terminated, interruptible, loading
-from usdbrdf.job.progress import fill_closed_streams, keep_usd_off_stdout, set_quiet, show, tell
+from usdbrdf.job.progress import (
+    fill_closed_streams,
+    in_one_line,
+    keep_usd_off_stdout,
+    set_quiet,
+    show,
+    tell,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,5 +74,5 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _refuse(message: str, status: int) -> int:
-    tell(f"usdbrdf: {message}")
+    tell(f"usdbrdf: {in_one_line(message)}")
     return status

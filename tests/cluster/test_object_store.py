@@ -224,11 +224,16 @@ def test_a_store_without_credentials_is_a_sentence(server: str, tmp_path: Path) 
     assert "EnvironmentFailure" in found.stderr
 
 
+class ParamValidationError(Exception):
+    """As botocore calls it."""
+
+
 @pytest.mark.parametrize(
     ("error", "told"),
     [
         (PermissionError("AccessDenied"), "access is denied here (AccessDenied)"),
         (ConnectionError("reset"), "the object store failed (ConnectionError: reset)"),
+        (ParamValidationError("Bad\nname"), "is no place in an object store (Bad name)"),
         (TimeoutError(), "the object store failed (TimeoutError: )"),
         (OSError(errno.ENOSPC, "No space left"), "does not fit on a disk ([Errno 28] No space"),
     ],
@@ -244,6 +249,7 @@ def test_what_a_store_refuses_is_a_failure_of_the_environment(
     with pytest.raises(EnvironmentFailure) as found:
         theirs.keep_result({"found": np.arange(5)})
     assert told in str(found.value)
+    assert "\n" not in str(found.value)
     assert str(found.value).endswith("[cluster.objects]")
 
 
@@ -252,6 +258,24 @@ def test_stores_that_nobody_can_share_or_knows_are_refused(tmp_path: Path) -> No
         ClusterOptions(shared_folder="memory://scans")
     with pytest.raises(EnvironmentFailure, match=r"nosuch.*\[cluster.objects\]"):
         files_at("nosuch://scans/some", tmp_path)
+
+
+@pytest.mark.parametrize("said", ["s3://", "s3:///some", "://some", "gs:// /some"])
+def test_a_store_without_a_bucket_is_refused(said: str) -> None:
+    """The first was taken for a folder of that name."""
+    with pytest.raises(UsageError, match=r"names no bucket.*\[usage.option\]"):
+        ClusterOptions(shared_folder=said)
+
+
+def test_a_store_that_is_asked_at_once_and_does_not_answer_is_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def silent(*_: object, **__: object) -> None:
+        raise RuntimeError("no\nanswer")
+
+    monkeypatch.setattr(fsspec.core, "url_to_fs", silent)
+    with pytest.raises(EnvironmentFailure, match=r"RuntimeError: no answer.*\[cluster.objects\]"):
+        files_at("github://some:scans@/main", tmp_path)
 
 
 def test_what_talks_to_a_store_may_not_be_installed(

@@ -323,6 +323,21 @@ def test_workers_of_two_kinds_exclude_each_other() -> None:
         ClusterOptions(workers=2, scheduler="tcp://127.0.0.1:8786")
 
 
+@pytest.mark.parametrize(
+    "said", ["tcp://head\n:8786", "head: 8786", "tcp://", "tcp://head:0", "head:99999", "tcp:///x"]
+)
+def test_what_is_no_address_of_a_scheduler_is_said_before_any_work(said: str) -> None:
+    with pytest.raises(UsageError, match=r"no address of a scheduler.*\[usage.option\]"):
+        ClusterOptions(scheduler=said)
+
+
+@pytest.mark.parametrize(
+    "said", ["head", "head:8786", "tls://head:8786", "tcp://[::1]:8786", "inproc://10.0.0.1/7/1"]
+)
+def test_what_dask_takes_for_an_address_is_one(said: str) -> None:
+    assert ClusterOptions(scheduler=said).scheduler == said
+
+
 def test_one_process_needs_no_dask() -> None:
     told = "import sys, usdbrdf.pipeline; print({'dask', 'distributed'} & {*sys.modules})"
     found = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True)

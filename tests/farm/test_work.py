@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from usdbrdf.farm.scans import list_of
 from usdbrdf.farm.table import exit_code, rows_of
 from usdbrdf.farm.work import Work, work_on
 from usdbrdf.job.interrupts import Terminated
+from usdbrdf.job.stamp import stamp_of, stamp_path, write_stamp
 from usdbrdf.options import ConvertOptions
 
 COARSE = ["--texel-size", "0.4", "--rays", "16", "--max-pixels", "50", "--environment", "none"]
@@ -249,6 +251,7 @@ def test_the_whole_is_as_good_as_its_worst(tmp_path):
 
     def code(*statuses: str) -> int:
         for name, status in zip(scans.names, statuses, strict=True):
+            make_asset(results.asset(name))
             write_record(results.record(name), Record(status=status))
         return exit_code(rows_of(scans, results))
 
@@ -260,6 +263,42 @@ def test_the_whole_is_as_good_as_its_worst(tmp_path):
     assert code("refused", "defect", "good") == 1
     assert code("refused", "crashed", "unfinished") == 4
     assert code("begun", "good", "good") == 4
+
+
+def make_asset(folder: Path) -> None:
+    """Of one map, with the stamp of its step."""
+    (folder / ".usdbrdf/stamps").mkdir(parents=True, exist_ok=True)
+    (folder / "map.exr").touch()
+    stamp = stamp_of("texture", {}, {})
+    write_stamp(stamp_path(folder, 2, "texture"), replace(stamp, outputs={"map.exr": "0" * 64}))
+
+
+@pytest.mark.parametrize("lost", ["map.exr", ".usdbrdf", ""])
+@pytest.mark.parametrize("status", ["good", "invalid"])
+def test_an_asset_that_is_gone_is_not_good(tmp_path, capsys, lost, status):
+    """Though its record says so."""
+    (tmp_path / "scan").mkdir()
+    assert main(["farm", str(tmp_path / "scan"), "-o", str(tmp_path / "farm"), "-q"]) == 0
+    results = Results(tmp_path / "farm/results")
+    asset = results.asset("scan")
+    make_asset(asset)
+    write_record(results.record("scan"), Record(status=status, objects=3, measured=2))
+    results.page("scan").parent.mkdir()
+    results.page("scan").touch()
+    words = ["farm-table", str(tmp_path / "farm"), "--json"]
+    capsys.readouterr()
+    assert main(words) == (0 if status == "good" else 7)
+    assert checked(capsys.readouterr().out, "farm-table")["measured"] == 2
+    if (asset / lost).is_dir():
+        shutil.rmtree(asset / lost)
+    else:
+        (asset / lost).unlink()
+    assert main(words) == 4
+    told = checked(capsys.readouterr().out, "farm-table")
+    assert told["counts"] == {"unfinished": 1}
+    assert told["measured"] == 0
+    assert told["scans"][0]["sentence"].startswith(f"{asset}/")
+    assert 'href="pages/scan.html"' not in results.table.read_text("utf-8")
 
 
 @pytest.mark.parametrize("code", [0, 1, 2, 3, 4, 5, 7])

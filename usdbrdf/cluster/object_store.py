@@ -179,7 +179,7 @@ class Objects(Files):
 
     def _failed(self, error: Exception) -> EnvironmentFailure:
         """What a store's refusal means; those that pass were tried again by its library."""
-        kind = type(error).__name__
+        kind, said = type(error).__name__, " ".join(str(error).split())
         if isinstance(error, FileNotFoundError):
             return _Missing(
                 f"{self.address}: no such bucket or object. Make the bucket, and give the same "
@@ -187,18 +187,23 @@ class Objects(Files):
             )
         if isinstance(error, PermissionError) or "Credential" in kind or "Auth" in kind:
             return EnvironmentFailure(
-                f"{self.address}: access is denied here ({error}). Let this process and all "
+                f"{self.address}: access is denied here ({said}). Let this process and all "
                 "workers have credentials that may read, write, list and delete there. "
                 "[cluster.objects]"
             )
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return EnvironmentFailure(
-                f"{self.address}: what lies there does not fit on a disk ({error}). Free space "
+                f"{self.address}: what lies there does not fit on a disk ({said}). Free space "
                 "where copies of it are, in Dask's folder of the worker (--local-directory), then "
                 "run the same command again; finished work is kept. [cluster.objects]"
             )
+        if "Validation" in kind:  # of the name alone, before anybody is asked
+            return EnvironmentFailure(
+                f"{self.address}: is no place in an object store ({said}). Correct "
+                "--shared-folder. [cluster.objects]"
+            )
         return EnvironmentFailure(
-            f"{self.address}: the object store failed ({kind}: {error}). See whether this machine "
+            f"{self.address}: the object store failed ({kind}: {said}). See whether this machine "
             "reaches it, then run the same command again; finished work is kept. [cluster.objects]"
         )
 
@@ -274,5 +279,11 @@ def _file_system(address: str) -> tuple[Any, str]:
         raise EnvironmentFailure(
             f"--shared-folder {address}: {error}. Give a folder, or a URL that fsspec knows, such "
             "as s3://BUCKET/PREFIX. [cluster.objects]"
+        ) from error
+    except Exception as error:  # of those that ask their store at once, of every library its own
+        raise EnvironmentFailure(
+            f"--shared-folder {address}: the object store does not answer "
+            f"({type(error).__name__}: {' '.join(str(error).split())}). See whether this machine "
+            "reaches it, then run the same command again; finished work is kept. [cluster.objects]"
         ) from error
     return system, str(prefix)

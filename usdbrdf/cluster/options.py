@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from usdbrdf.errors import UsageError
 from usdbrdf.option import Options, option
+
+# Hosts, without a scheme or with any that Dask has learnt, and a port where there is one.
+_ADDRESS = re.compile(r"(?!\w*://(?:[/:]|\Z))[^\s/:]\S*", re.ASCII)
+_PORT = re.compile(r":(\d+)\Z", re.ASCII)
+# What a URL has between its scheme and a prefix; of files that is the prefix.
+_STORE = re.compile(r"(?:(?:file|local):///|[a-z][a-z0-9+.-]*://[^/\s]).*", re.DOTALL | re.ASCII)
 
 
 def is_url(place: object) -> bool:
@@ -35,6 +42,16 @@ class ClusterOptions(Options):
         super().__post_init__()
         if self.workers is not None and self.scheduler is not None:
             raise UsageError("--workers, --scheduler: they exclude each other. [usage.option]")
+        if self.scheduler is not None and not _is_address(self.scheduler):
+            raise UsageError(
+                f"--scheduler {self.scheduler}: is no address of a scheduler. Give one such as "
+                "tls://HOST:8786. [usage.option]"
+            )
+        if is_url(self.shared_folder) and not _STORE.fullmatch(str(self.shared_folder)):
+            raise UsageError(
+                f"--shared-folder {self.shared_folder}: names no bucket. Give a folder, or a store "
+                "such as s3://BUCKET/PREFIX. [usage.option]"
+            )
         if is_url(self.shared_folder) and "memory://" in str(self.shared_folder):
             raise UsageError(
                 f"--shared-folder {self.shared_folder}: no other process sees this one's memory. "
@@ -45,3 +62,8 @@ class ClusterOptions(Options):
     def asked(self) -> bool:
         """Whether others than this process are to work."""
         return self.workers is not None or self.scheduler is not None
+
+
+def _is_address(text: str) -> bool:
+    port = _PORT.search(text)
+    return bool(_ADDRESS.fullmatch(text)) and (port is None or 0 < int(port[1]) < 1 << 16)

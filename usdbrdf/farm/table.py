@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from usdbrdf.farm.records import Record, Results, read_record
 from usdbrdf.farm.scans import ScanList
+from usdbrdf.job.stamp import missing_of
 
 # How a table calls them, and what the whole comes to: the first of these that some scan has. Trying
 # again may help one that nobody began, or that was left; then what a defect is; then the rest.
@@ -44,6 +46,8 @@ def rows_of(scans: ScanList, results: Results) -> list[Row]:
 def _row(name: str, place: str, results: Results) -> Row:
     found = read_record(results.record(name))
     record, page = found or Record(status="begun"), results.page(name)
+    if record.status in ("good", "invalid"):
+        record = _while_it_is_there(record, results.asset(name))
     told = record.status in ("good", "invalid") and page.is_file()
     return Row(
         name=name,
@@ -56,6 +60,15 @@ def _row(name: str, place: str, results: Results) -> Row:
         seconds=record.seconds,
         page=page.relative_to(results.folder).as_posix() if told else "",
     )
+
+
+def _while_it_is_there(record: Record, asset: Path) -> Record:
+    """The record of a scan that was converted, or that of one that is to be again: its asset may
+    have been deleted since, or a part of it."""
+    if (missing := missing_of(asset)) is None:
+        return record
+    sentence = f"{asset / missing}: is gone; the next run of the job makes it again. [farm.asset]"
+    return Record(status="unfinished", sentence=sentence)
 
 
 def exit_code(rows: Sequence[Row]) -> int:

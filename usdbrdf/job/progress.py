@@ -103,7 +103,7 @@ def _give_up(stream: TextIO) -> None:
 
 def warn(sentence: str) -> None:
     """Say what was left out or may be wrong, and go on."""
-    say(f"warning: {sentence}")
+    say(f"warning: {in_one_line(sentence)}")
 
 
 def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Iterator[T]:
@@ -133,6 +133,12 @@ def _left(seconds: float, done: int, total: int) -> str:
         return ""
     left = seconds / done * (total - done)
     return f", about {left:.0f} s left" if left < 100 else f", about {left / 60:.0f} min left"
+
+
+def in_one_line(text: str) -> str:
+    """The text with newlines escaped, too: a sentence that quotes a name, or words of a library,
+    stays one."""
+    return text.replace("\n", "\\n")
 
 
 def printable(text: str) -> str:

@@ -167,6 +167,16 @@ def why_rerun(asset: Path, order: int, wanted: Stamp) -> str | None:
     return f"output missing: {missing[0]}" if missing else None
 
 
+def missing_of(asset: Path) -> str | None:
+    """The first file that stamps tell of and that is not there, or the folder of stamps where that
+    has none; what is in the files is not looked at."""
+    stamps = [*filter(None, map(read_stamp, sorted((asset / STATE_FOLDER).glob("stamps/*.json"))))]
+    if not stamps:
+        return f"{STATE_FOLDER}/stamps"
+    names = (name for stamp in stamps for name in (*stamp.outputs, *stamp.once))
+    return next((name for name in names if not (asset / name).is_file()), None)
+
+
 def known_hashes(state_folder: Path) -> dict[str, set[str]]:
     """Every hash that stamps and journals give for a published file, by asset-relative path."""
     paths = [*state_folder.glob("stamps/*.json"), *state_folder.glob("publishing-*.json")]
