@@ -42,7 +42,7 @@ _MOST_ACROSS = 1024
 # Frames in which patterns are looked for, even among all, and points on the surface, drawn evenly
 # from the pixels of these; a second difference counts as no more than this, and an object's
 # patterns are told by so many points in so many frames each.
-_FRAMES, _POINTS, _SEED, _LARGEST, _FEWEST, _TWICE = 96, 16384, 0, 0.3, 30, 3
+_FRAMES, _POINTS, _SEED, _LARGEST, _FEWEST, _FEWEST_FRAMES = 96, 16384, 0, 0.3, 30, 3
 
 
 def texel_sizes_from_frames(scene: Scene, rays: RayScene, frames: Frames) -> TexelSizes:
@@ -150,7 +150,7 @@ def finer_where_patterned(
         own = _sides_of_pixels(surface.point[seen], surface.normal[seen], camera)
         density[seen] += (sizes.side[face[seen]] / own) ** 2
         looked_at += 1
-    told = times >= _TWICE
+    told = times >= _FEWEST_FRAMES
     owner = surface.owner[told]
     pairs = (first**2 - second)[told] / (times * (times - 1))[told]
     of_texel = density[told] * num_frames / looked_at
