@@ -41,8 +41,8 @@ _PIXELS = calibration.number("texel_size.pixels_of_texel")
 _MOST_ACROSS = 1024
 # Frames in which patterns are looked for, even among all, and points on the surface, drawn evenly
 # from the pixels of these; a second difference counts as no more than this, and an object's
-# patterns are told by so many points in so many frames each.
-_FRAMES, _POINTS, _SEED, _LARGEST, _FEWEST, _FEWEST_FRAMES = 96, 16384, 0, 0.3, 30, 3
+# patterns are told by so many points, in so many frames each: of fewer a median is noise.
+_FRAMES, _POINTS, _SEED, _LARGEST, _FEWEST, _FEWEST_FRAMES = 96, 16384, 0, 0.3, 128, 3
 
 
 def texel_sizes_from_frames(scene: Scene, rays: RayScene, frames: Frames) -> TexelSizes:
