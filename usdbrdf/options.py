@@ -186,7 +186,7 @@ class TextureOptions(Options):
     """How frames become the lit diffuse texture L_d."""
 
     texel_size: float | None = option(
-        "--texel-size M", None, (1e-6, 1e3), unset="what the frames' pixels cover of each chart"
+        "--texel-size M", None, (1e-6, 1e3), unset="what pixels cover, less where a pattern shows"
     )
     "side of a texel in metres, everywhere"
     quantile: float = option("--quantile P", 0.5, (1e-6, 1 - 1e-6))

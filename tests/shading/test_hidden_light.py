@@ -12,7 +12,7 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
 from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light, reflects_daylight
-from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
+from usdbrdf.shading.hidden_light import KnownLamps, _albedo, light_of_hidden
 from usdbrdf.transport.environment import NO_SUN, Environment, Sun, black_environment
 from usdbrdf.transport.irradiance import irradiance_at
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -243,3 +243,25 @@ def test_a_lamp_that_faces_the_sky_stays_one(tmp_path):
     assert found.groups.lamp.all()
     assert found.estimate.determined.all()
     np.testing.assert_allclose(found.lit[clips].mean(), shines, rtol=0.2)
+
+
+def test_what_stands_in_stripes_of_sunlight_is_no_lamp():
+    # Pixels blur the stripes that S has sharp: most texels exceed S, all together do not.
+    world = world_of([quad((k, 0, 0), (1, 0, 0), (0, 1, 0), (10, 10)) for k in (0, 2, 4, 6)])
+    texels = world.texels
+    every, owner = np.arange(len(texels)), texels.object_index()
+    striped = (owner == 0) & (every % 5 < 2)
+    irradiance = np.where(striped, 10.0, 1.0)
+    sent = np.select([striped, owner == 0, owner == 1], [3.0, 1.3, 1.3], 0.5) / np.pi
+
+    def shines(level: float) -> list[bool]:
+        """Which objects do, where this much more is sent by the first."""
+        light = np.where(owner == 0, level, 1) * sent
+        rows = [np.repeat(a[:, None], 3, axis=1).astype(np.float32) for a in (light, irradiance)]
+        lamps = KnownLamps(np.zeros(len(texels), bool), {})
+        lamp = _albedo(texels, every, *rows, every, lamps)[1]
+        return [bool(lamp[owner == k].all()) for k in range(4)]
+
+    # The median of all texels is what is usual, and no more than 1.
+    assert shines(1) == [False, True, False, False]
+    assert shines(7) == [True, True, False, False]

@@ -375,8 +375,8 @@ def test_what_pixels_leave_is_no_noise_where_halves_of_the_frames_agree(floor: W
         told = np.tile(np.float32([1, apart, 0.5, 3, 1, compared]), (SIDE * SIDE, 1))
         return share_that_is_no_noise(floor.texels, told, _footprint(floor))
 
-    # White noise that leaves so much would explain 3 / 0.5 * 0.5; of that 1.1 * 0.05 counts.
-    np.testing.assert_allclose(share(0.05, 1), 1 - 1.1 * 1.1 * 0.05 * 3, rtol=1e-3)
+    # White noise that leaves so much would explain 3 / 0.5 * 0.5; of that 0.05 / 0.95 counts.
+    np.testing.assert_allclose(share(0.05, 1), 1 - 1.1 * 0.05 / 0.95 * 3, rtol=1e-3)
     # What halves contradict each other on, and what they could not be asked, is noise.
     assert not share(1.0, 1).any()
     assert not share(0.05, 0).any()

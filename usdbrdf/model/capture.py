@@ -126,8 +126,9 @@ class Frames:
         return self.recorded or (alike,) * len(self)
 
     def of_lighting(self, name: str) -> range:
-        """The numbers of the frames that show one lighting; of all where there is but one."""
-        if not self.lightings:
+        """The numbers of the frames that show one lighting; of all where there is but one, or
+        none is named."""
+        if not (self.lightings and name):
             return range(len(self))
         first = self.lightings.index(name)
         return range(first, first + self.lightings.count(name))

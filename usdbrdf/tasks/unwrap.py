@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -41,7 +42,7 @@ def unwrap(asset: Asset, options: TextureOptions) -> TaskResult:
         name="unwrap",
         role="texturing",
         parameters={k: v for k, v in asdict(options).items() if k not in ("memory", "quantile")},
-        inputs=hashes_of_inputs(asset, "texturing", maps),
+        inputs=hashes_of_inputs(asset, "texturing", maps, photographs=True),
     )
 
     def work(run: TaskRun) -> dict[str, Any]:
@@ -86,7 +87,9 @@ def _sizes_by_frames(maps: AssetMaps, rays: RayScene) -> TexelSizes:
     points = points_of_patterns(scene, rays, frames, looked_at)
     read = ahead(lambda i: (frames.camera(i), read_frame(frames, i)), looked_at)
     bar = progress(read, total=len(looked_at), label="patterns", unit="frames")
-    return finer_where_patterned(sizes, scene, rays, points, bar, len(frames))
+    # Each lighting's pixels tell its texels.
+    most = max(Counter(frames.lightings).values(), default=len(frames))
+    return finer_where_patterned(sizes, scene, rays, points, bar, most)
 
 
 def charts_of_lightings(maps: AssetMaps) -> dict[str, Array]:

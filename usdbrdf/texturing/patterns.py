@@ -243,7 +243,7 @@ def share_that_is_no_noise(texels: Texels, told: Float, footprint: Float) -> Flo
     # patterns at all has those.
     owner = texels.object_index()
     both, alone = (np.bincount(owner, told[:, k] * told[:, 5]) for k in (0, 1))
-    alike = np.where(both > 0, np.clip(_MARGIN * alone / np.maximum(both, 1e-12), 0, 1), 1)
+    alike = np.where(both > 0, np.clip(alone / np.maximum(both - alone, 1e-12), 0, 1), 1)
     noise = _MARGIN * np.maximum(white * alike[owner], apart)
     share: Float = np.clip(1 - noise / np.maximum(explained, 1e-12), 0, 1)
     return np.where((explained > 0) & (free > 0), share, 0).astype(np.float32)

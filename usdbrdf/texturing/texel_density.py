@@ -114,7 +114,7 @@ def points_of_patterns(
     places: list[Float] = []
     faces: list[Int] = []
     for camera in map(frames.camera, looked_at):
-        drawn = rng.random((max(1, _POINTS // len(looked_at)), 2))
+        drawn = rng.random((_POINTS // len(looked_at), 2))
         origins, directions = camera.rays(drawn * [camera.width, camera.height])
         hits = rays.closest(origins, directions)
         met = hits.face >= 0
@@ -137,7 +137,7 @@ def finer_where_patterned(
     """Finer texels for objects with patterns, as many as there are pixels to tell them.
 
     pictures    of the frames that were looked at
-    num_frames  of the capture
+    num_frames  of the capture, or of its lighting that has most
     """
     surface, face = points
     first, second, times, density = np.zeros((4, len(face)))
@@ -172,11 +172,10 @@ def _second_differences(
     around = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
     places = np.stack([column, row], axis=-1)[:, None] + around
     x, y = places[..., 0], places[..., 1]
-    fits = pixels.valid & ~pixels.clipped & ~pixels.dark
     hits = rays.closest(*camera.rays(places.reshape(-1, 2) + 0.5))
     shown = np.where(hits.face >= 0, scene.face_object[hits.face], -1).reshape(x.shape)
-    level = pixels.radiance.mean(axis=2)[y, x].astype(np.float64)
-    whole: Bool = fits[y, x].all(axis=1) & (level > 0).all(axis=1)
+    level = pixels.radiance[y, x].mean(axis=-1, dtype=np.float64)
+    whole: Bool = pixels.valid[y, x].all(axis=1) & (level > 0).all(axis=1)
     whole &= (shown == surface.owner[seen, None]).all(axis=1)
     beside = level[:, 1:].mean(axis=1)
     difference = (level[:, 0] - beside) / np.where(whole, level[:, 0] + beside, 1)

@@ -210,8 +210,9 @@ def _told_of(interface: Path, path: Sdf.Path) -> list[Sdf.AssetPath]:
     """What the payload of a prim opens, as its interface tells; that may have been edited by hand,
     and adopted."""
     with suppress(Tf.ErrorException, AttributeError, TypeError):
-        prim = Sdf.Layer.OpenAsAnonymous(str(interface)).GetPrimAtPath(path)
-        known = prim.GetInfo("assetInfo").get(NEEDS, [])
+        # Kept: a prim goes with its layer.
+        layer = Sdf.Layer.OpenAsAnonymous(str(interface))
+        known = layer.GetPrimAtPath(path).GetInfo("assetInfo").get(NEEDS, [])
         if all(isinstance(each, Sdf.AssetPath) for each in known):
             return list(known)
     raise InputRefused(
