@@ -101,7 +101,7 @@ def test_help_says_default_and_unit_of_every_option(capsys):
         ("--min-component-area M2", "m^2", "default: 0.0001 of the mesh's area"),
         ("--max-nonfinite SHARE", "share", "(default: 0.01)"),
         ("--meters-per-unit M", "metres", "default: as the format says"),
-        ("--texel-size M", "metres", "default: what the frames' pixels cover of each chart"),
+        ("--texel-size M", "metres", "default: what pixels cover, less where a pattern shows"),
         ("--quantile P", "quantile", "(default: 0.5)"),
         ("--max-texels N", "texels", "default: as many as the memory holds"),
         ("--standard-error E", "relative", "(default: 0.03)"),
