@@ -17,7 +17,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
-from usdbrdf.files.atomic import environment_failures, shortage
+from usdbrdf.files.atomic import environment_failures, raise_shortage
 from usdbrdf.files.paths import refuse_nameless
 from usdbrdf.job.progress import say
 
@@ -173,8 +173,7 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
         except Exception as error:
             if adapter.name in MODULES:
                 raise
-            if (failure := shortage(error)) is not None:
-                raise failure from error
+            raise_shortage(error)
             say(f"warning: adapter {adapter.name!r} is skipped: {error!r}. [adapter.matches]")
     from usdbrdf.capture.unrecognised import what_lies_there
 
@@ -227,8 +226,7 @@ def _loaded(point: EntryPoint) -> Adapter:
             module = point.load()
         # What went well in a child may still raise here, SystemExit included.
         except (Exception, SystemExit) as error:
-            if (failure := shortage(error)) is not None:
-                raise failure from error
+            raise_shortage(error)
             problem = f"{type(error).__name__}: {error}"
         else:
             missing = [
@@ -278,8 +276,7 @@ def read_with(adapter: Adapter, path: Path, options: CaptureOptions) -> Scan:
     except Exception as error:
         if adapter.name in MODULES:
             raise
-        if (failure := shortage(error)) is not None:
-            raise failure from error
+        raise_shortage(error)
         raise InputRefused(
             f"{path}: adapter {adapter.name!r} ({adapter.origin}) failed: {error!r}. Report it to "
             "its authors. [adapter.read]"

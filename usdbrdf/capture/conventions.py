@@ -30,12 +30,10 @@ def _transposed(pose: Double) -> Double:
 def _turned(axis: int, quarters: int) -> Callable[[Double], Double]:
     """Poses turned about y (1) or z (2) by quarters, with the mesh that somebody has turned so."""
     first, second = (2, 0) if axis == 1 else (0, 1)
-    turn = np.eye(4)
-    for _ in range(quarters):
-        quarter = np.eye(4)
-        quarter[[first, second], [first, second]] = 0
-        quarter[first, second], quarter[second, first] = -1, 1
-        turn = quarter @ turn
+    quarter = np.eye(4)
+    quarter[[first, second], [first, second]] = 0
+    quarter[first, second], quarter[second, first] = -1, 1
+    turn = np.linalg.matrix_power(quarter, quarters)
     return lambda pose: np.asarray(turn @ pose, np.float64)
 
 

@@ -287,12 +287,13 @@ def failure_of_machine(error: Exception) -> EnvironmentFailure | None:
     return _failure(str(_place_of(error) or "this machine"), error)
 
 
-def shortage(error: BaseException) -> EnvironmentFailure | None:
-    """``failure_of_machine`` where no file that was being read can be to blame, whatever reader
-    stumbled: threads, open files, memory, a disk that fails. Permission is the file's."""
+def raise_shortage(error: BaseException) -> None:
+    """Raise ``failure_of_machine`` where no file that was being read can be to blame, whatever
+    reader stumbled: threads, open files, memory, a disk that fails. Permission is the file's."""
     if not isinstance(error, Exception) or isinstance(error, PermissionError):
-        return None
-    return failure_of_machine(error)
+        return
+    if (failure := failure_of_machine(error)) is not None:
+        raise failure from error
 
 
 def _place_of(error: OSError) -> object:

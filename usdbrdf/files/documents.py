@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
-from usdbrdf.files.atomic import shortage, write_text_atomic
+from usdbrdf.files.atomic import raise_shortage, write_text_atomic
 from usdbrdf.files.paths import why_not_fetched
 from usdbrdf.model.arrays import Array
 
@@ -244,11 +244,10 @@ DAMAGED_ARRAYS = (
 )  # fmt: skip
 
 
-def refusal_of_arrays(path: Path, error: Exception) -> UsdBrdfError:
-    """The sentence about a file of arrays that cannot be read, in one line; of a machine that can
-    read none, if that is why."""
-    if (failure := shortage(error)) is not None:
-        return failure
+def refusal_of_arrays(path: Path, error: Exception) -> InputRefused:
+    """The sentence about a file of arrays that cannot be read, in one line. Raises that of a
+    machine that can read none, if that is why."""
+    raise_shortage(error)
     said = " ".join(str(error).split())[:200]
     return InputRefused(
         f"{path}: not a readable array file ({said}); pickled data is refused. Write it again. "

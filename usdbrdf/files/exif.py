@@ -71,10 +71,7 @@ def exif_exposures(paths: Sequence[Path]) -> tuple[list[float] | None, bool]:
     """The light of each of several photographs, None where it cannot be compared, as some tell a
     time, an f-number or a speed and others do not; and whether any tells anything. Files that
     cannot be read, of which the reader of their pixels will tell, have that of another."""
-    known: dict[Path, Settings] = {}
-    for path in paths:
-        with suppress(ImageRefused):
-            known[path] = exif_settings(path)
+    known = _readable_settings(paths)
     columns = list(zip(*known.values(), strict=True))
     alike = all(len({one is None for one in column}) == 1 for column in columns)
     lights = {path: settings.light for path, settings in known.items()}
@@ -90,16 +87,21 @@ def exif_exposures(paths: Sequence[Path]) -> tuple[list[float] | None, bool]:
 def told_by_some(paths: Sequence[Path]) -> tuple[str, Path, Path] | None:
     """What some photographs tell of their exposure and others do not, in words, with one that tells
     it and one that does not; None where all tell the same, so that ``Settings.light`` compares."""
-    known: dict[Path, Settings] = {}
-    for path in paths:
-        with suppress(ImageRefused):
-            known[path] = exif_settings(path)
+    known = _readable_settings(paths)
     for name, word in (("number", "f-number"), ("speed", "ISO speed")):
         telling = [path for path, settings in known.items() if getattr(settings, name) is not None]
         silent = [path for path in known if path not in telling]
         if telling and silent:
             return word, telling[0], silent[0]
     return None
+
+
+def _readable_settings(paths: Sequence[Path]) -> dict[Path, Settings]:
+    known: dict[Path, Settings] = {}
+    for path in paths:
+        with suppress(ImageRefused):
+            known[path] = exif_settings(path)
+    return known
 
 
 def _first(value: object) -> object:

@@ -22,8 +22,8 @@ from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import (
     environment_failures,
     publish,
+    raise_shortage,
     sha256_of,
-    shortage,
     temporary_beside,
 )
 from usdbrdf.files.camera_colour import space_by_exif
@@ -377,8 +377,7 @@ def _decoding(path: Path, decoder: Any, problem: str, rule: str, making: int = 0
     try:
         yield
     except Exception as error:
-        if (failure := shortage(error)) is not None:
-            raise failure from error
+        raise_shortage(error)
         said = _message(decoder)
         scarce = isinstance(error, MemoryError) or (making and _WANT_OF_MEMORY.search(said))
         try:

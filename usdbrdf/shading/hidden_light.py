@@ -134,8 +134,8 @@ def _albedo(
     owner, count = texels.object_index(), len(texels.resolution)
     ratio, known = albedo_where_lit(lit, irradiance, np.ones(len(seen), np.bool_))
     # Where lamps are not known yet, what they shine on seems to reflect more than it receives.
-    usual = float(np.median(ratio[known])) if known.any() else NEUTRAL
-    ratio /= max(1.0, usual)
+    usual = max(1.0, float(np.median(ratio[known])) if known.any() else NEUTRAL)
+    ratio /= usual
     shines = known & (ratio.mean(axis=1) > clear_of(lamps.doubt))
     num_known, num_shining = (np.bincount(owner[seen], kind, count) for kind in (known, shines))
     lamp = num_shining > lamps.most * num_known
@@ -143,7 +143,7 @@ def _albedo(
     # it. All of it together does not.
     sends, receives = (
         np.bincount(owner[seen], np.where(known, light.mean(axis=1), 0), count)
-        for light in (np.pi * lit / max(1.0, usual), irradiance)
+        for light in (np.pi * lit / usual, irradiance)
     )
     lamp &= sends > clear_of(lamps.doubt) * receives
     for number, is_lamp in lamps.said.items():

@@ -121,9 +121,9 @@ def points_of_patterns(
         places.append((origins + hits.distance[:, None] * directions)[met])
         faces.append(hits.face[met])
     face = np.concatenate(faces)
-    normals = face_normals_and_angles(scene.points, scene.triangles)[0].astype(np.float64)
+    normal = face_normals_and_angles(scene.points, scene.triangles[face])[0]
     point = np.concatenate(places).astype(np.float64)
-    return PointsOfPatterns(MeshPoints(point, normals[face], scene.face_object[face]), face)
+    return PointsOfPatterns(MeshPoints(point, normal, scene.face_object[face]), face)
 
 
 def finer_where_patterned(

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from usdbrdf.errors import InputRefused, MeshMissing, UsdBrdfError
-from usdbrdf.files.atomic import shortage
+from usdbrdf.files.atomic import raise_shortage
 from usdbrdf.files.paths import why_not_fetched
 from usdbrdf.job.child import run_child
 from usdbrdf.job.memory import addresses_of_libraries, machine_bytes
@@ -110,8 +110,7 @@ def import_here(arrays: Mapping[str, Array], announced: Mapping[str, str]) -> di
     try:
         EntryPoint(**announced).load()
     except (Exception, SystemExit) as error:
-        if (failure := shortage(error)) is not None:
-            raise failure from error
+        raise_shortage(error)
         raise InputRefused(f"{type(error).__name__}: {error}. [adapter.load]") from error
     return {}
 

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused
-from usdbrdf.files.atomic import shortage
+from usdbrdf.files.atomic import raise_shortage
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Double, Int
 from usdbrdf.untrusted.bounds import read_in_child, refuse_large
@@ -123,8 +123,7 @@ def read_here(images: Path) -> ColmapModel:
             poses = [_camera_from_world(image.cam_from_world()) for image in found]
         # COLMAP says what it stumbles over in its own terms, by exceptions of several kinds.
         except Exception as error:
-            if (failure := shortage(error)) is not None:
-                raise failure from error
+            raise_shortage(error)
             said = " ".join(str(error).split()).replace(str(scratch), str(folder))[:200]
             raise InputRefused(
                 f"{folder}: COLMAP cannot read this model ({said}). Export it again. [colmap.model]"

@@ -19,7 +19,7 @@ from trimesh.exchange.obj import load_obj
 from trimesh.exchange.ply import load_ply
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused
-from usdbrdf.files.atomic import shortage
+from usdbrdf.files.atomic import raise_shortage
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.paths import contained
 from usdbrdf.job.progress import warn
@@ -142,8 +142,7 @@ def _parsed(path: Path, read: Callable[[BinaryIO], Any]) -> Any:
     except Exception as error:
         if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
             raise EnvironmentFailure(f"{path}: cannot be read ({error}). [mesh.read]") from error
-        if (failure := shortage(error)) is not None:
-            raise failure from error
+        raise_shortage(error)
         raise InputRefused(
             f"{path}: damaged or no {path.suffix[1:].upper()} mesh ({type(error).__name__}: "
             f"{' '.join(str(error).split())[:160]}). Export it again. [mesh.read]"

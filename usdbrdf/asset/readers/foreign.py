@@ -12,7 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 from pxr import Usd
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.atomic import sha256_of, shortage
+from usdbrdf.files.atomic import raise_shortage, sha256_of
 from usdbrdf.job.stamp import STATE_FOLDER, code_version, hashes_in, read_stamp
 from usdbrdf.untrusted.usd_paths import words_of
 
@@ -35,8 +35,7 @@ def refuses_foreign(what: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
             try:
                 return reader(*given, **named)
             except _STUMBLES as error:
-                if (failure := shortage(error)) is not None:
-                    raise failure from error
+                raise_shortage(error)
                 if _is_as_written(_stage_of(*given)):
                     raise
                 said = " ".join(words_of(error).split())[:_MAX_LENGTH]
