@@ -4,29 +4,15 @@ photographs shuffled, all of it turned and somewhere else."""
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import usdbrdf
-from tests.scenes import MadeCapture, make_capture, poses_down_and_up, write_ply
-from usdbrdf.asset.layout import Asset
+from tests.dim_room import converted, means_of_objects, write_objects
+from tests.scenes import MadeCapture, write_ply
 from usdbrdf.asset.maps import AssetMaps
-from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.scene import read_fit, read_shading
 from usdbrdf.job.progress import set_quiet
-
-OPTIONS = usdbrdf.ConvertOptions(
-    texture=usdbrdf.TextureOptions(texel_size=0.2),
-    shade=usdbrdf.ShadeOptions(sampling=usdbrdf.Sampling(standard_error=0.05, max_rays=256)),
-    fit=usdbrdf.FitOptions(max_pixels=60),
-)
-# Nothing but the lamp sends more than it receives from it.
-DIM = {
-    "ceiling": (0.125, 0.125, 0.125), "walls": (0.25, 0.3, 0.2), "floor": (0.25, 0.125, 0.0625),
-    "box": (0.06, 0.09, 0.12), "lamp": (32.0, 28.0, 24.0),
-}  # fmt: skip
 
 
 def _told_otherwise(made: MadeCapture) -> None:
@@ -41,11 +27,7 @@ def _told_otherwise(made: MadeCapture) -> None:
     write_ply(
         made.folder / "mesh.ply", points, made.triangles[faces], number[made.face_object[faces]]
     )
-    objects = [
-        {"id": int(number[i]), "name": name, "class_name": name}
-        for i, name in enumerate(made.names)
-    ]
-    (made.folder / "objects.json").write_text(json.dumps({"objects": objects[::-1]}))
+    write_objects(made, number)
     document = json.loads(made.manifest.read_text())
     for frame in document["frames"]:
         frame["transform_matrix"] = (moved @ np.array(frame["transform_matrix"])).tolist()
@@ -54,50 +36,25 @@ def _told_otherwise(made: MadeCapture) -> None:
     made.manifest.write_text(json.dumps(document))
 
 
-def _converted(folder: Path, subdivisions: int, *, otherwise: bool) -> AssetMaps:
-    made = make_capture(
-        folder / "scan", poses=poses_down_and_up(6, 6), subdivisions=subdivisions, radiance=DIM
-    )
-    if otherwise:
-        _told_otherwise(made)
-    usdbrdf.convert(made.folder, folder / "asset", OPTIONS)
-    return AssetMaps(open_measured(Asset.at(folder / "asset")))
-
-
-def _by_name(maps: AssetMaps) -> dict[str, dict[str, np.ndarray]]:
-    """What was measured of each object: means over its area."""
-    lit, irradiance, albedo = (maps.map(aov) for aov in ("lit", "irradiance", "albedo"))
-    area, observed = maps.texels.area, maps.coverage.observed
-    found = {}
-    for i, obj in enumerate(maps.scene.objects):
-        own = np.arange(len(area))[maps.texels.of_object(i)]
-        seen = own[observed[own] > 0]
-        found[obj.label] = {
-            "lit": np.average(lit[seen], axis=0, weights=area[seen]),
-            "irradiance": np.average(irradiance[seen], axis=0, weights=area[seen]),
-            "albedo": np.average(albedo[seen], axis=0, weights=area[seen]),
-        }
-    return found
-
-
 @pytest.fixture(scope="module")
 def both(tmp_path_factory):
     set_quiet(True)
     try:
         return tuple(
-            _converted(tmp_path_factory.mktemp("room"), subdivisions, otherwise=otherwise)
-            for subdivisions, otherwise in ((2, False), (3, True))
+            converted(tmp_path_factory.mktemp("room"), subdivisions, otherwise)
+            for subdivisions, otherwise in ((2, None), (3, _told_otherwise))
         )
     finally:
         set_quiet(False)
 
 
 def test_what_is_measured_of_objects_stays(both):
-    usual, other = map(_by_name, both)
+    relatives = {"lit": 1e-3, "irradiance": 0.1, "albedo": 0.08}
+    usual, other = (means_of_objects(maps, [*relatives]) for maps in both)
     assert set(usual) == set(other)
     # Texels of a third of the box: its sides are measured in other places.
     for name in usual:
-        for key, relative in {"lit": 1e-3, "irradiance": 0.1, "albedo": 0.08}.items():
+        for key, relative in relatives.items():
             np.testing.assert_allclose(
                 other[name][key], usual[name][key], rtol=relative, err_msg=f"{name}: {key}"
             )
