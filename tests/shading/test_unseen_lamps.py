@@ -17,7 +17,7 @@ from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved
 from usdbrdf.shading.shaded import find_emitters
-from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
+from usdbrdf.shading.unseen_lamps import UnseenLamps, known_well, lamps_that_explain
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
 from usdbrdf.transport.lights import lights_from_radiance
@@ -246,6 +246,18 @@ def test_what_a_person_says_of_one_says_nothing_of_another(hall, monkeypatch):
     assert LAMP not in found.object
     # What hardly anything is known of is no lamp all the same.
     assert (found.error < 1).all()
+
+
+def test_what_brings_most_of_the_light_need_not_be_known_as_well_as_what_brings_little():
+    # At the same error of 0.4: with half of the light S errs by 0.2 in place of log 2 without it.
+    part, error = np.array([1e-3, 0.2, 0.5, 0.73, 0.9]), 0.4
+    with_it, without = part * error, np.log(1 / (1 - part))
+    np.testing.assert_allclose((with_it / without)[[0, 2]], [0.4, 0.2 / np.log(2)], rtol=1e-3)
+    known = known_well(np.full(5, error), part)
+    np.testing.assert_array_equal(known, with_it / without < 0.3)
+    assert known.tolist() == [False, False, True, True, True]
+    assert known_well(np.array([0.25, 3.0]), np.array([0.0, 1.0])).all()
+    assert not known_well(np.array([np.inf]), np.array([1.0])).any()
 
 
 def test_what_only_reflects_is_none(hall):
