@@ -15,9 +15,10 @@ from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading import shaded
 from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
+from usdbrdf.shading.lamp_light import known_well
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved
 from usdbrdf.shading.shaded import find_emitters
-from usdbrdf.shading.unseen_lamps import UnseenLamps, known_well, lamps_that_explain
+from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
 from usdbrdf.transport.lights import lights_from_radiance
@@ -253,11 +254,11 @@ def test_what_brings_most_of_the_light_need_not_be_known_as_well_as_what_brings_
     part, error = np.array([1e-3, 0.2, 0.5, 0.73, 0.9]), 0.4
     with_it, without = part * error, np.log(1 / (1 - part))
     np.testing.assert_allclose((with_it / without)[[0, 2]], [0.4, 0.2 / np.log(2)], rtol=1e-3)
-    known = known_well(np.full(5, error), part)
+    known = known_well(np.full(5, error), part, 0.3)
     np.testing.assert_array_equal(known, with_it / without < 0.3)
     assert known.tolist() == [False, False, True, True, True]
-    assert known_well(np.array([0.25, 3.0]), np.array([0.0, 1.0])).all()
-    assert not known_well(np.array([np.inf]), np.array([1.0])).any()
+    assert known_well(np.array([0.25, 3.0]), np.array([0.0, 1.0]), 0.3).all()
+    assert not known_well(np.array([np.inf]), np.array([1.0]), 0.3).any()
 
 
 def test_what_only_reflects_is_none(hall):

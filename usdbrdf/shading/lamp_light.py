@@ -144,6 +144,18 @@ def shining(radiance: Double, near: Double, part: Double) -> Bool:
     return np.asarray((np.pi * radiance.mean(axis=1) > _BRIGHTER * near) & (part > LEAST_PART))
 
 
+def known_well(error: Double, part: Double, most: float) -> Bool:
+    """Which sources (K,) are known so well that light is with them closer to what it is than
+    without, by a factor ``most``.
+
+    The logarithm of S of which a source brings a ``part`` (K,) is off by part times the relative
+    ``error`` (K,) of its strength, and by -log(1 - part) if it is left out: what brings little must
+    be known well, and what brings most of the light need not.
+    """
+    part = np.clip(part, 1e-6, 1 - 1e-6)
+    return np.asarray(part * error < -most * np.log1p(-part), np.bool_)
+
+
 def brought(
     surface: TexturedScene, lamps: Lamps, texel: Long, seed: int, sampling: Sampling = CLOSELY
 ) -> Double:

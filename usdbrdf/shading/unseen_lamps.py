@@ -17,7 +17,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Double, Float, Int
+from usdbrdf.model.arrays import Array, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import asked_texels
@@ -28,6 +28,7 @@ from usdbrdf.shading.lamp_light import (
     ROUGHLY,
     beside_lamps,
     brought,
+    known_well,
     looked_at_closely,
     shining,
     sources_of,
@@ -38,17 +39,6 @@ from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
 _MOST_ERROR = calibration.number("unseen.most_error")
-
-
-def known_well(error: Double, part: Double) -> Bool:
-    """Which lamps (K,) are known so well that light is with them closer to what it is than without.
-
-    The logarithm of S where a lamp brings a ``part`` (K,) of it is off by part times the relative
-    ``error`` (K,) of its radiance, and by -log(1 - part) if it is left out: what brings little must
-    be known well, and what brings most of the light need not.
-    """
-    part = np.clip(part, 1e-6, 1 - 1e-6)
-    return np.asarray(part * error < -_MOST_ERROR * np.log1p(-part), np.bool_)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +137,7 @@ def lamps_that_explain(
         lamp = shining(found, near, part)[own] | certain
         if lamp.all():  # none of the others blurs what these are any more
             brightness = np.log(np.pi * found.mean(axis=1) / near)[own]
-            lamp = (brightness > 2 * error[own]) & known_well(error[own], part[own])
+            lamp = (brightness > 2 * error[own]) & known_well(error[own], part[own], _MOST_ERROR)
             lamp |= certain & (error[own] < MOST_OF_CERTAIN)
         if lamp.all():
             order = np.argsort(likely.object)
