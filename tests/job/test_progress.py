@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from usdbrdf.job import progress as module
-from usdbrdf.job.progress import progress, say, set_quiet
+from usdbrdf.job.progress import progress, say, set_quiet, warn
 
 
 @pytest.fixture(autouse=True)
@@ -53,6 +54,25 @@ def test_the_lines_say_how_much_longer_it_takes(capsys, monkeypatch):
 def test_names_cannot_command_the_terminal(capsys):
     say("chair \x1b[2J\u202e椅子")
     assert capsys.readouterr().err == "chair \\x1b[2J\\u202e椅子\n"
+
+
+def test_what_is_said_is_one_line_whatever_it_quotes(capsys):
+    say("a\nb.exr: gone\r\x1b[31m")
+    warn("'a\nwarning: all is well': gone")
+    assert capsys.readouterr().err.splitlines() == [
+        "a\\nb.exr: gone\\r\\x1b[31m",
+        "warning: 'a\\nwarning: all is well': gone",
+    ]
+
+
+def test_warnings_are_told_by_one_function():
+    package = Path(module.__file__).parents[1]
+    begun = [
+        file.relative_to(package).as_posix()
+        for file in sorted(package.rglob("*.py"))
+        if re.search(r"(say|tell)\(\s*f?\"warning: ", file.read_text("utf-8"))
+    ]
+    assert begun == ["job/progress.py"]
 
 
 def test_quiet(capsys):

@@ -11,6 +11,8 @@ from usdbrdf.option import Options, option
 # Hosts, without a scheme or with any that Dask has learnt, and a port where there is one.
 _ADDRESS = re.compile(r"(?!\w*://(?:[/:]|\Z))[^\s/:]\S*", re.ASCII)
 _PORT = re.compile(r":(\d+)\Z", re.ASCII)
+# What may be called a bucket of S3, or an access point to one.
+_OF_S3 = re.compile(r"s3a?://(?:[\w.-]{1,255}|arn:[^\s/]+)(?:/.*)?", re.DOTALL | re.ASCII)
 # What a URL has between its scheme and a prefix; of files that is the prefix.
 _STORE = re.compile(r"(?:(?:file|local):///|[a-z][a-z0-9+.-]*://[^/\s]).*", re.DOTALL | re.ASCII)
 
@@ -47,16 +49,8 @@ class ClusterOptions(Options):
                 f"--scheduler {self.scheduler}: is no address of a scheduler. Give one such as "
                 "tls://HOST:8786. [usage.option]"
             )
-        if is_url(self.shared_folder) and not _STORE.fullmatch(str(self.shared_folder)):
-            raise UsageError(
-                f"--shared-folder {self.shared_folder}: names no bucket. Give a folder, or a store "
-                "such as s3://BUCKET/PREFIX. [usage.option]"
-            )
-        if is_url(self.shared_folder) and "memory://" in str(self.shared_folder):
-            raise UsageError(
-                f"--shared-folder {self.shared_folder}: no other process sees this one's memory. "
-                "Give a folder, or a store such as s3://BUCKET/PREFIX. [usage.option]"
-            )
+        if is_url(self.shared_folder) and (why := _why_no_store(str(self.shared_folder))):
+            raise UsageError(f"--shared-folder {self.shared_folder}: {why}. [usage.option]")
 
     @property
     def asked(self) -> bool:
@@ -67,3 +61,17 @@ class ClusterOptions(Options):
 def _is_address(text: str) -> bool:
     port = _PORT.search(text)
     return bool(_ADDRESS.fullmatch(text)) and (port is None or 0 < int(port[1]) < 1 << 16)
+
+
+def _why_no_store(url: str) -> str:
+    """Why nobody could share it, and what to give; "" where somebody may."""
+    if "::" in url.partition("://")[0]:
+        return f"is a chain of stores. Give that at its end alone, {url.rpartition('::')[2]}"
+    such = "Give a folder, or a store such as s3://BUCKET/PREFIX"
+    if not _STORE.fullmatch(url):
+        return f"names no bucket or host. {such}"
+    if url.startswith(("s3:", "s3a:")) and not _OF_S3.fullmatch(url):
+        return f"no bucket can be called so. {such}"
+    if url.startswith("memory:"):
+        return f"no other process sees this one's memory. {such}"
+    return ""
