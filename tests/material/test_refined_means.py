@@ -1,4 +1,4 @@
-"""What a sample counts for, and what it is relative to, against numbers that are reckoned by hand."""
+"""What a sample counts for, and what it is relative to, against numbers reckoned by hand."""
 
 from __future__ import annotations
 
