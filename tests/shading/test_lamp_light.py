@@ -178,7 +178,7 @@ def test_texels_within_two_of_a_shadow_s_edge_are_not_asked(
     for step, passes in ((0.29, True), (0.31, False)):
 
         def other(light: int, row: Any, column: Any, step: float = step) -> Any:
-            return np.where(column < 8, 1.0 if light == 0 else 1.0, 1 - (0, step / 2)[light])
+            return np.where(column < 8, 1.0, 1 - (0, step / 2)[light])
 
         even = _lit_by(hall, monkeypatch, other)
         assert even[:, 7].all() == passes
