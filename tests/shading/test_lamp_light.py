@@ -18,6 +18,7 @@ from usdbrdf.shading.lamp_light import (
     beside_lamps,
     beside_others,
     brought,
+    looked_at_closely,
     shining,
     sources_of,
     without,
@@ -139,9 +140,11 @@ def test_a_source_s_part_is_of_what_reaches_the_texels_that_it_lights(hall: Worl
 
 
 def test_a_lamp_is_thrice_as_bright_as_a_white_wall_and_a_tenth_of_the_light():
-    near, part = np.array([1.0, 1, 1, 1]), np.array([0.5, 0.5, 0.11, 0.1])
-    radiance = np.repeat(np.array([3.01, 2.99, 3.01, 9])[:, None], 3, axis=1) / np.pi
-    assert shining(radiance, near, part).tolist() == [True, False, True, False]
+    near, part = np.array([1.0, 1, 1, 1, 2, 2]), np.array([0.5, 0.5, 0.11, 0.1, 0.5, 0.5])
+    level = np.array([3.01, 2.99, 3.01, 9, 6.01, 5.99])
+    radiance = np.repeat(level[:, None], 3, axis=1) / np.pi
+    found = shining(radiance, near, part)
+    assert found.tolist() == [True, False, True, False, True, False]
     # Of the channels' mean.
     one = np.array([[9.1, 0, 0]]) / np.pi
     assert shining(one, near[:1], part[:1]).tolist() == [True]
@@ -203,6 +206,11 @@ def test_segments_of_which_few_lie_evenly_leave_unless_too_few_stay(
         assert even.ravel()[alone].all() == stays
         assert even.ravel()[alone].any() == stays
         assert even[:, 10:].all()
+
+    # One of which all lie at the edge, after which none is counted.
+    at_edge = (FLOOR % SIDE >= 6) & (FLOOR % SIDE < 10)
+    even = _lit_by(hall, monkeypatch, edge, segment=at_edge.astype(np.int32))
+    assert (even.ravel() == ~at_edge).all()
 
     def stripes(share: int) -> Any:
         return lambda light, _, column: np.where(column < share, 1.0, column * 5.0 * (1 - light))
@@ -304,3 +312,71 @@ def test_what_lights_a_scan_beside_daylight_is_asked_of_texels_that_do_not_clip_
     none = beside.of(np.array([False]))
     assert (none.likely.object.tolist(), none.likely.clipped.tolist()) == ([], [0, 2])
     assert none.count == 2
+
+
+def test_lamps_are_looked_at_closely_where_they_light_evenly(
+    hall: World, monkeypatch: pytest.MonkeyPatch
+):
+    """Every other texel, with what is mirrored to frames of all but the lamps, and of each lamp
+    alone from surface to surface."""
+    surface, lamps = _surface(hall), _lamps(hall, -1, 0, 1)
+    lit = np.ones((len(hall.texels), 3), np.float32)
+    asked, even = _asked(FLOOR[:40]), np.arange(40) % 2 == 0
+    told: dict[str, Any] = {}
+    monkeypatch.setattr(lamp_light, "beside_lamps", lambda *of: told.update(beside=of) or asked)
+    monkeypatch.setattr(lamp_light, "_evenly_lit", lambda *of: told.update(even=of) or even)
+    share = np.ones((2, 20))
+    monkeypatch.setattr(lamp_light, "brought", lambda *of: told.update(brought=of) or share)
+
+    def to_frames(*of: Any) -> Any:
+        told["frames"] = of
+        return np.full((20, 3), 0.25)
+
+    def sent_on(of: Any, light: Any, texel: Any, seed: int) -> Any:
+        told.setdefault("sent", []).append((light, seed))
+        assert of is surface
+        return np.repeat(texel[:, None], 3, axis=1) * (1.0 + light[-1, 0])
+
+    monkeypatch.setattr(lamp_light, "mirrored_to_frames", to_frames)
+    monkeypatch.setattr(lamp_light, "mirrored_irradiance", sent_on)
+    monkeypatch.setattr(lamp_light, "gloss_of_scene", lambda *of: told.update(gloss=of) or "glossy")
+    monkeypatch.setattr(lamp_light, "strengths", lambda *of: of)
+    frames: Any = object()
+    strength = np.array([1.0, 2.0])
+    found = looked_at_closely(surface, lit, DARK, frames, asked, lamps, strength, 5)
+    assert told["beside"] == (surface, lit, DARK, asked, lamps, 5)
+    assert told["even"] == (surface, asked, lamps, strength, 5)
+    its_asked, its_sources, certain = found
+    texel = FLOOR[:40:2]
+    np.testing.assert_array_equal(its_asked.texel, texel)
+    np.testing.assert_allclose(its_asked.mirrored, np.pi / 4)
+    assert (its_sources, certain is lamps.certain) == ("glossy", True)
+    gloss_asked, sources, through = told["gloss"]
+    assert gloss_asked is its_asked
+    assert sources.share is share
+    np.testing.assert_array_equal(through, np.stack([texel, 2 * texel]))
+    # Other rays than those that told which lie evenly, and others for each lamp.
+    rest = told["frames"]
+    assert (rest[0], rest[2], rest[3]) == (surface, DARK, frames)
+    np.testing.assert_array_equal(rest[1], without(lit, lamps))
+    own = rest[5]
+    assert own == told["brought"][3] == 5 ^ 0x1A3
+    assert [seed for _, seed in told["sent"]] == [own, own + 1]
+
+
+def test_strengths_are_those_that_explain_most_and_their_errors_the_largest_channel_s(
+    hall: World, monkeypatch: pytest.MonkeyPatch
+):
+    solution = Solution(
+        np.log([[2.0, 3, 4], [5, 6, 7]]), np.zeros((1, 3)), np.zeros(3), np.zeros((1, 3))
+    )
+    monkeypatch.setattr(lamp_light, "solved", lambda *_: solution)
+    monkeypatch.setattr(lamp_light, "jackknife", lambda *_: np.array([[0.3, 0, 0], [0, 0, 0.5]]))
+    monkeypatch.setattr(lamp_light, "pull_of_prior", lambda *_: np.array([[0.4, 0, 0], [0.0] * 3]))
+    lamps = _lamps(hall, -1, 0, 1)
+    sources = sources_of(lamps, np.ones((2, 4)))
+    found = lamp_light.strengths(_asked(np.arange(4), irradiance=[1.0]), sources, lamps.certain)
+    np.testing.assert_allclose(found.radiance, [[2, 3, 4], [5, 6, 7]])
+    np.testing.assert_allclose(found.error, [0.5, 0.5])
+    np.testing.assert_allclose(found.near, 1 + 3 + 6)
+    np.testing.assert_allclose(found.part, [3 / 10, 6 / 10])
