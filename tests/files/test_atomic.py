@@ -382,7 +382,13 @@ def test_a_copy_that_does_not_fit_names_its_place_and_the_limit(tmp_path):
 
 
 def test_asking_whether_a_process_lives_does_nothing_to_it(monkeypatch):
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+    # A shell may have told its children to overlook that it hung up.
+    waits = (
+        "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL); print(flush=True); input()"
+    )
+    command = [sys.executable, "-c", waits]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
         assert atomic._is_in_use("x", str(other.pid))
         time.sleep(0.2)
         assert other.poll() is None
