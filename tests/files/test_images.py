@@ -22,6 +22,7 @@ from usdbrdf.files.images import (
     kind_of_colours,
     read_exr,
     read_radiance,
+    resized,
     write_exr,
     write_preview_png,
 )
@@ -74,6 +75,17 @@ def test_equal_pixels_give_equal_bytes(tmp_path, radiance):
 
 
 @pytest.mark.fault("I14")
+@pytest.mark.parametrize("channels", [1, 3])
+def test_at_another_size_a_pixel_is_the_mean_of_what_it_covers(channels):
+    pixels = np.random.default_rng(3).random((4, 9, channels)).astype(np.float32)
+    found = resized(pixels, 3, 2)
+    assert found.dtype == np.float32
+    blocks = pixels.reshape(2, 2, 3, 3, channels).mean(axis=(1, 3))
+    np.testing.assert_allclose(found, blocks, rtol=1e-5)
+    larger = resized(pixels[::2, ::3], 6, 4)
+    np.testing.assert_allclose(larger, pixels[::2, ::3].repeat(2, axis=0).repeat(2, axis=1))
+
+
 def test_half_floats_are_clamped_and_counted(tmp_path):
     pixels = np.array([[[65504, 65505, -1e30], [0, 1, 2]]], np.float32)
     assert write_exr(tmp_path / "a.exr", pixels) == 2

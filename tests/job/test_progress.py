@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 from usdbrdf.job import progress as module
 from usdbrdf.job.progress import progress, say, set_quiet, warn
 
@@ -100,3 +101,51 @@ os.write(file, str(file).encode())
         [*call, str(tmp_path / "file")], env={**os.environ, "PYTHONPATH": search}, check=True
     )
     assert int((tmp_path / "file").read_text()) > 2
+
+
+class _Output:
+    """A stdout that fails, with a descriptor to send what is left nowhere by."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        self._file, self._error = path.open("w"), error
+
+    def write(self, text: str) -> None:
+        raise self._error
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_reader_who_goes_away_has_seen_enough_unless_it_needs_the_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: bool
+):
+    gone = _Output(tmp_path / "gone", BrokenPipeError())
+    monkeypatch.setattr(sys, "stdout", gone)
+    if whole:
+        with pytest.raises(UsdBrdfError, match=r"its reader went away.*environment\.output"):
+            module.show("table", whole=True)
+    else:
+        module.show("table")
+    os.write(gone.fileno(), b"what is left")
+    assert (tmp_path / "gone").read_bytes() == b""
+    gone.close()
+    full = _Output(tmp_path / "full", OSError(28, "No space left on device"))
+    monkeypatch.setattr(sys, "stdout", full)
+    with pytest.raises(EnvironmentFailure, match=r"cannot be written \(No space left"):
+        module.show("table", whole=whole)
+    full.close()
+    monkeypatch.setattr(sys, "stdout", None)
+    if whole:
+        with pytest.raises(EnvironmentFailure, match=r"stdout is closed"):
+            module.show("table", whole=True)
+    else:
+        module.show("table")
+
+
+def test_lines_to_stdout_are_there_at_once(capsys: pytest.CaptureFixture[str]):
+    module.show("one\ntwo")
+    assert capsys.readouterr() == ("one\ntwo\n", "")
