@@ -39,6 +39,8 @@ _AROUND = 2
 _UNEVEN, _OF_OTHER_LIGHT = calibration.pair("unseen.uneven")
 # Among the sources of one scan, beside the sky's patches and the sun, which are 0.
 _LAMP = 1
+# In the dark some of the little light that arrives is not known.
+_STRAY = calibration.number("lamps.stray")
 _LEAST_EVEN = calibration.number("unseen.least_even")
 _BRIGHTER = calibration.number("unseen.brighter")
 LEAST_PART = calibration.number("unseen.least_part")
@@ -114,6 +116,7 @@ def sources_of(lamps: Lamps, share: Double) -> Sources:
         family=np.full(len(share), _LAMP, np.int64),
         pairs=np.zeros((0, 2), np.int64),
         apart=np.zeros(0),
+        stray=_STRAY,
     )
 
 
