@@ -84,6 +84,21 @@ def test_each_lamp_brings_what_it_sends_alone(hall: World):
     np.testing.assert_allclose(found, wanted, rtol=0.03)
 
 
+def test_what_lamps_bring_is_sampled_as_asked(hall: World, monkeypatch: pytest.MonkeyPatch):
+    asked: list[Any] = []
+
+    def brings(_: Any, __: Any, texel: Any, seed: int, sampling: Any) -> Any:
+        asked.append((seed, sampling))
+        return np.zeros(len(texel))
+
+    monkeypatch.setattr(lamp_light, "_brought", brings)
+    surface, lamps = _surface(hall), _lamps(hall, -1, 1, 0)
+    brought(surface, lamps, FLOOR, 3)
+    brought(surface, lamps, FLOOR, 3, lamp_light.ROUGHLY)
+    closely, roughly = lamp_light.CLOSELY, lamp_light.ROUGHLY
+    assert asked == [(3, closely), (4, closely), (3, roughly), (4, roughly)]
+
+
 def test_without_lamps_all_else_stays(hall: World):
     lit = np.arange(3 * len(hall.texels), dtype=np.float32).reshape(-1, 3) + 1
     found = without(lit, _lamps(hall, -1, 0, -1))
