@@ -11,7 +11,11 @@ from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
-from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light, reflects_daylight
+from usdbrdf.shading.clipped_light import (
+    clipped_groups,
+    estimate_clipped_light,
+    reflects_other_light,
+)
 from usdbrdf.shading.hidden_light import KnownLamps, _albedo, light_of_hidden
 from usdbrdf.transport.environment import NO_SUN, Environment, Sun, black_environment
 from usdbrdf.transport.irradiance import irradiance_at
@@ -214,15 +218,15 @@ def test_a_patch_in_the_sun_that_clips_is_no_lamp():
     groups = clipped_groups(texels, lit, coverage)
     assert set(groups.object[groups.lamp]) == {TABLE, LAMP}
     given, once = (surface, lit, coverage, frames, groups), np.ones(len(groups))
-    found = reflects_daylight(*given, once, sky, 0)
+    found = reflects_other_light(*given, once, sky, 0)
     assert {int(i) for i in groups.object[found]} == {TABLE}
     walls = groups.with_walls(found)
     assert set(walls.object[walls.lamp]) == {LAMP}
     np.testing.assert_array_equal(walls.wall, clips & (owner == TABLE))
     # Without the sun nothing explains it.
-    assert not reflects_daylight(*given, once, sky.under(NO_SUN), 0).any()
+    assert not reflects_other_light(*given, once, sky.under(NO_SUN), 0).any()
     # Nor does it what is much brighter, by the light that it casts.
-    assert not reflects_daylight(*given, 5 * once, sky, 0).any()
+    assert not reflects_other_light(*given, 5 * once, sky, 0).any()
 
 
 def test_a_lamp_that_faces_the_sky_stays_one(tmp_path):

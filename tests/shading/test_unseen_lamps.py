@@ -35,6 +35,9 @@ FRAMES = frames_at(
     ]
 )
 
+# One of the blocks that stand in the room.
+BLOCK = 8
+
 
 @pytest.fixture(scope="module")
 def hall():
@@ -224,6 +227,24 @@ def test_a_lamp_that_clips_is_unknown_meanwhile(hall):
     found = lamps_that_explain(surface, shown, CoverageMap.of(seen, clipped), FRAMES, DARK, 0)
     assert found.object.tolist() == [LAMP]
     np.testing.assert_allclose(found.radiance[0], RADIANCE, rtol=0.25)
+
+
+def test_what_clips_in_the_light_of_a_lamp_that_no_frame_shows_is_none(hall, tmp_path):
+    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
+    lit[surface.texels.of_object(LAMP)] = RADIANCE
+    block = surface.texels.object_index() == BLOCK
+    limit = np.quantile(lit[block].max(axis=1), 0.3)
+    clipped = block & (lit.max(axis=1) > limit)
+    shown = np.where(clipped[:, None], np.minimum(lit, limit), lit)
+    seen = CoverageMap.of(coverage.observed & ~clipped, clipped)
+
+    def is_lamp(name: str, **given: bool) -> list[bool]:
+        run = TaskRun(tmp_path, "shade", tmp_path / name)
+        light = estimate_clipped_light(run, surface, shown, seen, FRAMES, DARK, 0, **given)
+        return light.groups.lamp.tolist()
+
+    assert is_lamp("nothing else") == [True]
+    assert is_lamp("lit", lit_unseen=True) == [False]
 
 
 def test_what_a_person_says_of_an_object_holds(hall):

@@ -203,9 +203,12 @@ def estimate_clipped_light(
     environment: Environment,
     seed: int,
     said: Mapping[int, bool] = MappingProxyType({}),
+    *,
+    lit_unseen: bool = False,
 ) -> ClippedLight:
     """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
-    said: of objects whether they are lamps, where that is known."""
+    said: of objects whether they are lamps, where that is known. lit_unseen: by lamps that no frame
+    shows, whose radiance is in ``lit``."""
     groups = clipped_groups(surface.texels, lit, coverage, said)
     if not groups.lamp.any():
         return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
@@ -218,12 +221,12 @@ def estimate_clipped_light(
             return {**vars(none), "wall": wall}
         evidence = _evidence(surface, lit, groups, chosen, segment, environment, seed)
         first = estimate_clipped_emitters(evidence)
-        if environment.sun.shines or environment.image.any():
+        if lit_unseen or environment.sun.shines or environment.image.any():
             by_hand = [said.get(int(i), False) for i in groups.object]
             least = np.where(first.determined, first.least().max(axis=1), 1.0)
             least = np.where(by_hand, np.inf, least)
             given = surface, lit, coverage, frames, groups, least, environment, seed
-            wall = reflects_daylight(*given)
+            wall = reflects_other_light(*given)
         left = groups.with_walls(wall)
         if wall.any():
             first = estimate_clipped_emitters(
@@ -240,7 +243,7 @@ def estimate_clipped_light(
     )
 
 
-def reflects_daylight(
+def reflects_other_light(
     surface: TexturedScene,
     lit: Float,
     coverage: CoverageMap,
@@ -251,10 +254,10 @@ def reflects_daylight(
     seed: int,
 ) -> Bool:
     """(K,): of the groups that look like lamps those that clip because of the light that falls on
-    them: by the albedo of what was measured of the object, and what a usual dielectric mirrors,
-    some of their texels would be about as bright as they are at least, ``least`` (K,) times their
-    bounds; of an object of which nothing was measured, if it were white, as bright as that. The
-    light of all these groups is left out."""
+    them, from outside or of lamps that no frame shows: by the albedo of what was measured of the
+    object, and what a usual dielectric mirrors, some of their texels would be about as bright as
+    they are at least, ``least`` (K,) times their bounds; of an object of which nothing was
+    measured, if it were white, as bright as that. The light of all these groups is left out."""
     texels, lamps = surface.texels, np.flatnonzero(groups.lamp & np.isfinite(least))
     owner = texels.object_index()
 

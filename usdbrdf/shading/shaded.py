@@ -354,7 +354,10 @@ def _light(
     known = KnownLamps(may_shine, said, doubt=doubt)
     measured = lit, coverage, environment, seed, known
     lit, unseen = _lit_by_unseen_lamps(run, surface, *measured, frames, shine)
-    light = estimate_clipped_light(run, surface, lit, coverage, frames, environment, seed, said)
+    light = estimate_clipped_light(
+        run, surface, lit, coverage, frames, environment, seed, said,
+        lit_unseen=bool(len(unseen.object)),
+    )  # fmt: skip
     lamps = light.groups.texels_of(light.groups.lamp) | np.isin(owner, unseen.object)
     if (light.lit[lamps] == filled[lamps]).all() and not (may_shine & ~told & ~lamps).any():
         return light, unseen
