@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from usdbrdf.errors import UsageError
-from usdbrdf.option import Options, option
+from usdbrdf.option import Options, is_one_line, option
 
 # Hosts, without a scheme or with any that Dask has learnt, and a port where there is one.
 _ADDRESS = re.compile(r"(?!\w*://(?:[/:]|\Z))[^\s/:]\S*", re.ASCII)
@@ -30,7 +30,7 @@ class ClusterOptions(Options):
     scheduler: str | None = option("--scheduler ADDRESS", None)
     "do it on the workers of a Dask cluster, such as tls://HOST:8786, that are installed as this is"
     shared_folder: Path | str | None = option(
-        "--shared-folder DIR|URL", None, unset="in the asset", url=True
+        "--shared-folder DIR|URL", None, unset="in the asset", url=True, one_line=True
     )
     """folder that all workers see under this name, for what they work with, or an object store,
     such as s3://BUCKET/PREFIX, by which they get photographs too"""
@@ -44,7 +44,7 @@ class ClusterOptions(Options):
             raise UsageError("--workers, --scheduler: they exclude each other. [usage.option]")
         if self.scheduler is not None and not _is_address(self.scheduler):
             raise UsageError(
-                f"--scheduler {self.scheduler}: is no address of a scheduler. Give one such as "
+                f"--scheduler {self.scheduler!r}: is no address of a scheduler. Give one such as "
                 "tls://HOST:8786. [usage.option]"
             )
         if is_url(self.shared_folder) and not _STORE.fullmatch(str(self.shared_folder)):
@@ -66,4 +66,5 @@ class ClusterOptions(Options):
 
 def _is_address(text: str) -> bool:
     port = _PORT.search(text)
-    return bool(_ADDRESS.fullmatch(text)) and (port is None or 0 < int(port[1]) < 1 << 16)
+    named = _ADDRESS.fullmatch(text) is not None and is_one_line(text)
+    return named and (port is None or 0 < int(port[1]) < 1 << 16)
