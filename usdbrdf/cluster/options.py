@@ -11,6 +11,9 @@ from usdbrdf.option import Options, is_one_line, option
 # Hosts, without a scheme or with any that Dask has learnt, and a port where there is one.
 _ADDRESS = re.compile(r"(?!\w*://(?:[/:]|\Z))[^\s/:]\S*", re.ASCII)
 _PORT = re.compile(r":(\d+)\Z", re.ASCII)
+# What the libraries of object stores read as a pattern, as a version, or as the end of one URL and
+# the begin of another; a host may be a number in brackets.
+_PATTERN = re.compile(r"[^/]*//[^/]*/.*([*?[]|::)", re.DOTALL)
 # What a URL has between its scheme and a prefix; of files that is the prefix.
 _STORE = re.compile(r"(?:(?:file|local):///|[a-z][a-z0-9+.-]*://[^/\s]).*", re.DOTALL | re.ASCII)
 
@@ -51,6 +54,12 @@ class ClusterOptions(Options):
             raise UsageError(
                 f"--shared-folder {self.shared_folder}: names no bucket. Give a folder, or a store "
                 "such as s3://BUCKET/PREFIX. [usage.option]"
+            )
+        if is_url(self.shared_folder) and _PATTERN.match(str(self.shared_folder)):
+            raise UsageError(
+                f"--shared-folder {self.shared_folder}: has one of *, ?, [ or :: in it, which "
+                "stand for more than themselves in object stores. Give another prefix. "
+                "[usage.option]"
             )
         if is_url(self.shared_folder) and "memory://" in str(self.shared_folder):
             raise UsageError(
