@@ -234,7 +234,8 @@ def test_without_its_scheduler_a_run_ends_in_a_sentence_and_goes_on_from_there(
     copy: Asset, alone: dict[str, str], cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address, start = cluster
-    strike(monkeypatch, 3, start().kill)
+    # The first six are no units: light that is found in this process.
+    strike(monkeypatch, 8, start().kill)
     with (
         workers_of(ClusterOptions(scheduler=address)) as workers,
         pytest.raises(EnvironmentFailure, match=r"scheduler is gone.*\[cluster.scheduler\]"),
