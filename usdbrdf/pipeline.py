@@ -34,7 +34,7 @@ from usdbrdf.errors import OwnershipConflict
 from usdbrdf.files.atomic import environment_failures
 from usdbrdf.job.first_run import compiling_beside
 from usdbrdf.job.ownership import edited_files, is_held, owned_folder
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import say, warn
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.job.task import TaskResult
 from usdbrdf.job.units import HERE, Workers
@@ -123,7 +123,7 @@ def working_on(
         changed = edited_files(asset.folder)
         damaged = [file for file in changed if is_damaged(asset.folder / file)]
         for file in damaged:
-            say(f"warning: {asset.folder / file}: damaged; it is made again. [layer.damaged]")
+            warn(f"{asset.folder / file}: damaged; it is made again. [layer.damaged]")
         edited = [file for file in changed if file not in damaged]
         if edited and hand_edits == "refuse":
             raise OwnershipConflict(

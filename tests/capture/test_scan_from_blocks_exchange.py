@@ -459,6 +459,25 @@ def test_systems_whose_coordinates_are_lengths_are_read(tmp_path, system):
     assert_same(read_scan(tmp_path, OPTIONS), room)
 
 
+@pytest.mark.parametrize("other", [ENU, f" {ENU.lower()}\n"])
+def test_a_system_that_is_listed_twice_is_one(tmp_path, other):
+    room = truth().square()
+    again = f"<SRS><Id>3</Id><Name>Again</Name><Definition>{other}</Definition></SRS>"
+    end = "</SpatialReferenceSystems>"
+    document = _document(room).replace(end, f"{again}{end}")
+    document = document.replace("<Photogroup>", "<Photogroup><SRSId>3</SRSId>")
+    _write(tmp_path, room, document)
+    assert_same(read_scan(tmp_path, OPTIONS), room)
+
+
+def test_systems_that_nothing_defines_are_known_by_their_ids(tmp_path):
+    room = truth().square()
+    document = _document(room).replace("<Photogroup>", "<Photogroup><SRSId>7</SRSId>")
+    _write(tmp_path, room, document.replace("<SRSId>2<", "<SRSId>8<"))
+    with pytest.raises(InputRefused, match=r"several coordinate systems \(SRSId 7, 8\)"):
+        read_scan(tmp_path, OPTIONS)
+
+
 def test_of_several_blocks_the_one_with_most_poses_is_read(tmp_path):
     room = truth().square()
     other = "<Block><Name>Block_1</Name><Photogroups/></Block><Block><Name>"

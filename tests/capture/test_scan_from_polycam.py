@@ -64,6 +64,25 @@ def test_folders_of_corrected_cameras_may_be_empty(tmp_path):
     assert any("no corrected cameras" in sentence for sentence in scan.warnings)
 
 
+def test_what_systems_leave_in_folders_is_passed_over(tmp_path):
+    """A Finder's notes, and the halves that an archive of a Mac brings of each file."""
+    room = truth()
+    whole = _write(tmp_path, room, corrected=False)
+    for name in ("corrected_cameras", "corrected_images"):
+        (tmp_path / "keyframes" / name).mkdir()
+        (tmp_path / "keyframes" / name / ".DS_Store").write_bytes(b"\0\0\0\1Bud1")
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / ".DS_Store").touch()
+    for file in [f for f in tmp_path.rglob("*") if f.is_file() and f.name[0] != "."]:
+        file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X")
+    assert choose_adapter(tmp_path).name == "polycam"
+    scan = read_scan(tmp_path, OPTIONS)
+    points = room.points @ whole[:3, :3].T + whole[:3, 3]
+    assert_same(scan, room, points=points, poses=whole @ room.world_from_camera)
+    assert any("no corrected cameras" in sentence for sentence in scan.warnings)
+    assert not any("masked" in sentence for sentence in scan.warnings)
+
+
 def test_corrected_cameras_stand_in_the_frame_of_the_mesh(tmp_path):
     room = truth()
     whole = _write(tmp_path, room)

@@ -70,6 +70,13 @@ def test_a_scene_that_has_been_unpacked(scene, room):
     assert {each.class_name for each in scan.objects} == set(room.names)
 
 
+def test_halves_of_files_that_an_archive_of_a_mac_brings_are_passed_over(scene, room):
+    for file in [f for f in scene.rglob("*") if f.is_file()]:
+        file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X")
+    scan = read_scan(scene, OPTIONS)
+    assert_same(scan, room, names=tuple(f"{name}_{i}" for i, name in enumerate(room.names)))
+
+
 @pytest.mark.parametrize("kept", ["intrinsics_color.txt", "scene0000_00.txt"])
 def test_the_lens_may_stand_elsewhere(scene, room, kept):
     if kept == "intrinsics_color.txt":

@@ -219,12 +219,97 @@ def _write_nerfstudio(folder, room, *, bad=()):
     (folder / "transforms.json").write_text(json.dumps(document))
 
 
+def _without_model(scene, room, **how):
+    """As who downloads what nerfstudio needs has a scene; the lens of the document bends light."""
+    _write_nerfstudio(scene / "dslr" / "nerfstudio", room, **how)
+    for path in (scene / "dslr" / "colmap").iterdir():
+        path.unlink()
+    (scene / "dslr" / "colmap").rmdir()
+
+
+def test_a_scene_without_a_model_is_read_from_its_document(scene, room):
+    _without_model(scene, room, bad=(3,))
+    mask = scene / "dslr" / "resized_anon_masks" / "DSC00004.png"
+    write_image(mask, np.ones((HEIGHT, WIDTH, 3)))
+    assert choose_adapter(scene).name == "scannetpp"
+    scan = read_scan(scene, OPTIONS)
+    assert_same(scan, room, poses=np.delete(room.world_from_camera, 3, axis=0))
+    assert "floor_1" in [each.label for each in scan.objects]
+    assert [view.mask for view in scan.views if view and view.mask] == [mask]
+    said = [one for one in scan.warnings if "axes" in one]
+    assert len(said) == 1
+    assert "transforms.json: belongs to a scene of ScanNet++, so its axes" in said[0]
+    assert "state applied_transform" not in said[0]
+
+
+def test_undistorted_photographs_of_a_scene_without_a_model(scene, room):
+    _without_model(scene, room)
+    document = scene / "dslr" / "nerfstudio" / "transforms.json"
+    undistorted = document.with_name("transforms_undistorted.json")
+    undistorted.write_bytes(document.read_bytes())
+    said = {**json.loads(document.read_text()), "camera_model": "OPENCV_FISHEYE", "k1": 0.1}
+    document.write_text(json.dumps(said))
+    name = "resized_undistorted_images"
+    (scene / "dslr" / "resized_images").rename(scene / "dslr" / name)
+    assert_same(read_scan(scene, OPTIONS), room)
+    undistorted.unlink()
+    with pytest.raises(InputRefused, match=r"undistorted.json: not there, nor .*capture.camera\]"):
+        read_scan(scene, OPTIONS)
+
+
+def test_a_telephones_model_without_pictures_is_not_taken_for_the_document_with_them(scene, room):
+    _write_nerfstudio(scene / "dslr" / "nerfstudio", room)
+    (scene / "iphone").mkdir()
+    (scene / "dslr" / "colmap").rename(scene / "iphone" / "colmap")
+    assert_same(read_scan(scene, OPTIONS), room)
+
+
+def _alone(folder, room):
+    """The document with what it names beside it."""
+    _write_nerfstudio(folder, room)
+    for i, image in enumerate(room.images):
+        write_image(folder / f"DSC{i:05d}.JPG", image)
+    write_ply(folder / "mesh.ply", room.points, room.triangles)
+    return folder / "transforms.json"
+
+
+def test_a_document_alone_without_test_frames_is_known_by_its_bad_ones(tmp_path, room):
+    document = _alone(tmp_path, room)
+    said = json.loads(document.read_text())
+    said["frames"] += said.pop("test_frames")
+    document.write_text(json.dumps(said))
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, room)
+    assert any("is_bad, as documents of ScanNet++ have" in one for one in scan.warnings)
+
+
+@pytest.mark.parametrize("old", [True, False])
+def test_axes_that_a_model_beside_knows_are_told_as_they_are(scene, tmp_path, room, old):
+    document = _alone(tmp_path / "alone", room)
+    model = document.parent / "colmap" / "sparse"
+    model.mkdir(parents=True)
+    (scene / "dslr" / "colmap").rename(model / "0")
+    if not old:
+        said = json.loads(document.read_text())
+        for row, pose in zip(said["frames"], room.world_from_camera, strict=False):
+            row["transform_matrix"] = pose.tolist()
+        for row, pose in zip(said["test_frames"], room.world_from_camera[-2:], strict=True):
+            row["transform_matrix"] = pose.tolist()
+        document.write_text(json.dumps(said))
+    scan = read_scan(document.parent, OPTIONS)
+    assert_same(scan, room)
+    assert sum("undone" in said for said in scan.warnings) == old
+
+
 def test_frames_that_are_said_to_be_bad_are_left_out(scene, room):
     _write_nerfstudio(scene / "dslr" / "nerfstudio", room, bad=(3, 9))
     scan = read_scan(scene, OPTIONS)
     assert len(scan.frames) == 8
     assert not {"DSC00003.JPG", "DSC00009.JPG"} & {path.name for path in scan.frames.image_paths}
-    assert any("2 of 10 frames are left out" in said for said in scan.warnings)
+    assert any(
+        "dslr/nerfstudio/transforms.json: 2 of 10 frames are left out" in said
+        for said in scan.warnings
+    )
 
 
 def test_a_document_within_a_scene_names_the_scene(scene, room):

@@ -166,6 +166,130 @@ def test_a_moving_camera_finds_pictures_by_number_in_another_place(tmp_path, roo
     assert scan.counts["poses_without_photograph"] == 1
 
 
+def camera_with_few_keys(stage, room):
+    camera = UsdGeom.Camera.Define(stage, "/room/camera")
+    place, turn = camera.AddTranslateOp(), camera.AddRotateXYZOp()
+    for time, x, turned in ((1, 1.4, 10.0), (10, 2.6, 60.0), (19, 1.5, 130.0), (28, 1.6, 200.0)):
+        place.Set(Gf.Vec3d(x, 1 + time / 30, 1.5), time)
+        turn.Set(Gf.Vec3f(72.0, 5.0, turned), time)
+    _set_lens(camera, room.intrinsics[0])
+    return camera
+
+
+def named_plate(prim):
+    prim.AddAppliedSchema("BackPlateAPI:photograph")
+    return prim.CreateAttribute("backPlate:photograph:image", Sdf.ValueTypeNames.Asset)
+
+
+def poses_at(camera, times):
+    return np.array([np.array(camera.ComputeLocalToWorldTransform(t)).T for t in times])
+
+
+def test_a_plates_name_lasts_and_its_picture_was_taken_when_it_begins(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    camera = camera_with_few_keys(stage, room)
+    plate = named_plate(camera.GetPrim())
+    for i, image in enumerate(room.images):
+        plate.Set(Sdf.AssetPath(f"./plates/{9 - i}.exr"), 1 + 3 * i)
+        write_image(tmp_path / "shot" / "plates" / f"{9 - i}.exr", image)
+    stage.Save()
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room, poses=poses_at(camera, range(1, 29, 3)))
+
+
+def test_a_sequence_that_is_named_by_one_of_its_pictures(tmp_path, room):
+    """As of programs that keep the file which was chosen in the dialog."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    moving_camera(stage, room)
+    named_plate(stage.GetPrimAtPath("/room/camera")).Set(Sdf.AssetPath("./plates/p2.0103.exr"))
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "plates" / f"p2.{101 + i:04d}.exr", image)
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room)
+
+
+def test_a_sequence_has_no_picture_between_its_numbers(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    camera = camera_with_few_keys(stage, room)
+    for time in (1.25, 2.75):
+        camera.GetOrderedXformOps()[0].Set(Gf.Vec3d(1.4 + time / 50, 1 + time / 30, 1.5), time)
+    named_plate(camera.GetPrim()).Set(Sdf.AssetPath("./plates/p.####.exr"))
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "plates" / f"p.{1 + i:04d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room, poses=poses_at(camera, range(1, 11)))
+    assert scan.counts["poses_without_photograph"] == 2
+
+
+@pytest.mark.parametrize("before", [Sdf.ValueBlock(), Sdf.AssetPath("")])
+def test_a_camera_without_a_plate_at_first_has_those_that_follow(tmp_path, room, before):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    moving_camera(stage, room, [f"./plates/{9 - i}.exr" for i in range(10)])
+    prim = stage.GetPrimAtPath("/room/camera")
+    prim.GetAttribute("backPlate:photograph:image").Set(before, 90)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "plates" / f"{9 - i}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room)
+    assert scan.counts["poses_without_photograph"] == 1
+
+
+def test_one_sequence_may_follow_another(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    moving_camera(stage, room)
+    plate = named_plate(stage.GetPrimAtPath("/room/camera"))
+    for name, time in (("a", 101), ("b", 106)):
+        plate.Set(Sdf.AssetPath(f"./plates/{name}.####.exr"), time)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "plates" / f"{'ab'[i > 4]}.{101 + i:04d}.exr", image)
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room)
+
+
+def test_a_plate_that_is_there_is_no_sequence_and_neither_is_a_folder(tmp_path, room):
+    folder = tmp_path / "take #1"
+    stage = make_stage(folder / "room.usda", room)
+    moving_camera(stage, room, [f"./plates/%d/#{9 - i}.exr" for i in range(10)])
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(folder / "plates" / "%d" / f"#{9 - i}.exr", image)
+    assert_same(read_scan(folder, IngestOptions()), room)
+
+
+def test_the_second_camera_of_a_pair_without_pictures_is_told(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    for i, (image, pose) in enumerate(zip(room.images, room.world_from_camera, strict=True)):
+        for side in ("left", "right"):
+            camera = UsdGeom.Camera.Define(stage, f"/shots/{side}_{i}")
+            camera.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
+            _set_lens(camera, room.intrinsics[i])
+            camera.CreateStereoRoleAttr(side)
+        named_plate(stage.GetPrimAtPath(f"/shots/left_{i}")).Set(f"./plates/{i}.exr")
+        write_image(tmp_path / "shot" / "plates" / f"{i}.exr", image)
+    UsdGeom.Camera.Define(stage, "/views/persp")  # a program's own
+    stage.Save()
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room)
+    assert any("10 cameras beside" in one and "/shots/right_0" in one for one in scan.warnings)
+
+
+def test_a_camera_that_moves_before_one_picture_is_left_out(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    many_cameras(stage, room)
+    for i, image in enumerate(room.images):
+        prim = stage.GetPrimAtPath(f"/shots/IMG_{i:03d}")
+        named_plate(prim).Set(Sdf.AssetPath(f"./plates/{i}.exr"))
+        write_image(tmp_path / "shot" / "plates" / f"{i}.exr", image)
+    moving_camera(stage, room)
+    named_plate(stage.GetPrimAtPath("/room/camera")).Set(Sdf.AssetPath("./plates/3.exr"))
+    stage.Save()
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room)
+    assert any("'/room/camera': it names one picture for 10 times" in w for w in scan.warnings)
+
+
 def test_a_camera_with_few_keys_is_where_usd_interpolates_it(tmp_path, room):
     stage = make_stage(tmp_path / "shot" / "room.usda", room)
     camera = UsdGeom.Camera.Define(stage, "/room/camera")

@@ -233,7 +233,6 @@ class ParamValidationError(Exception):
     [
         (PermissionError("AccessDenied"), "access is denied here (AccessDenied)"),
         (ConnectionError("reset"), "the object store failed (ConnectionError: reset)"),
-        (ParamValidationError("Bad\nname"), "is no place in an object store (Bad name)"),
         (TimeoutError(), "the object store failed (TimeoutError: )"),
         (OSError(errno.ENOSPC, "No space left"), "does not fit on a disk ([Errno 28] No space"),
     ],
@@ -253,10 +252,67 @@ def test_what_a_store_refuses_is_a_failure_of_the_environment(
     assert str(found.value).endswith("[cluster.objects]")
 
 
+def test_a_name_that_no_store_has_is_a_wrong_option(
+    theirs: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ParamValidationError("Bad\nname")
+
+    assert isinstance(theirs.files, Objects)
+    monkeypatch.setattr(theirs.files._system, "put_file", refuse)
+    told = r"^--shared-folder .* is no place in an object store \(Bad name\).*\[cluster.objects\]$"
+    with pytest.raises(UsageError, match=told):
+        theirs.keep_result({"found": np.arange(5)})
+
+
+@pytest.mark.parametrize(
+    ("place", "kind", "told"),
+    [
+        ("nosuch://scans/some", UsageError, "nosuch"),
+        ("gs://scans/some", EnvironmentFailure, "not installed"),
+        (Path("/proc/no"), UsageError, "nothing can be written there"),
+        (Path(__file__), UsageError, "File exists"),
+        (Path("/proc/self"), EnvironmentFailure, "nothing can be written there"),
+    ],
+)
+def test_what_cannot_be_shared_is_told_before_any_work(
+    place: str | Path, kind: type[UsdBrdfError], told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != Path("/proc/self"))
+    said = ClusterOptions(workers=1, shared_folder=place)
+    with (
+        pytest.raises(kind, match=rf"^--shared-folder {place}: .*{told}.*\.\w+\]$"),
+        workers_of(said),
+    ):
+        pytest.fail("work begins")
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("filecache::s3://scans/some", "is a chain of stores. Give .* alone, s3://scans/some"),
+        ("simplecache::zip://a::gs://b", "is a chain of stores. Give .* alone, gs://b"),
+        ("s3://bad!bucket/some", "no bucket can be called so"),
+        ("s3a://b\u00fccher", "no bucket can be called so"),
+        ("hdfs:///some", "names no bucket or host"),
+    ],
+)
+def test_what_no_store_is_called_is_refused_with_what_to_give(said: str, told: str) -> None:
+    with pytest.raises(UsageError, match=rf"^--shared-folder {said}: {told}.*\[usage.option\]$"):
+        ClusterOptions(shared_folder=said)
+
+
+def test_names_that_buckets_have_are_taken() -> None:
+    point = "s3://arn:aws:s3:us-west-2:123456789012:accesspoint/some/prefix"
+    for said in ("s3://Some_old.bucket-1", "s3://b/a:b", "hdfs://host:9000/a", point):
+        assert ClusterOptions(shared_folder=said).shared_folder == said
+
+
 def test_stores_that_nobody_can_share_or_knows_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no other process sees"):
         ClusterOptions(shared_folder="memory://scans")
-    with pytest.raises(EnvironmentFailure, match=r"nosuch.*\[cluster.objects\]"):
+    with pytest.raises(UsageError, match=r"nosuch.*\[cluster.objects\]"):
         files_at("nosuch://scans/some", tmp_path)
 
 
@@ -268,11 +324,11 @@ def test_a_store_without_a_bucket_is_refused(said: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "said", ["s3://b/scans[1]", "s3://b/a*/c", "s3://b/a?versionId=3", "s3://b/a::s3://c/d"]
+    "said", ["s3://b/scans[1]", "s3://b/a*/c", "s3://b/a?versionId=3", "s3://b/a::b"]
 )
 def test_a_prefix_that_stands_for_more_than_itself_is_refused(said: str) -> None:
     """What was uploaded below the first was never deleted: no object matched it."""
-    with pytest.raises(UsageError, match=r"stand for more than themselves.*\[usage.option\]"):
+    with pytest.raises(UsageError, match=r"stores read as more than that.*\[usage.option\]"):
         ClusterOptions(shared_folder=said)
     assert ClusterOptions(shared_folder="sftp://[::1]:22/scans").shared_folder is not None
 

@@ -15,6 +15,8 @@ import pytest
 
 from tests.json_schemas import checked
 from tests.scenes import make_capture
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.manifest import Manifest, write_manifest
 from usdbrdf.cli import main
 from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused
 from usdbrdf.farm import work as module
@@ -299,6 +301,51 @@ def test_an_asset_that_is_gone_is_not_good(tmp_path, capsys, lost, status):
     assert told["measured"] == 0
     assert told["scans"][0]["sentence"].startswith(f"{asset}/")
     assert 'href="pages/scan.html"' not in results.table.read_text("utf-8")
+
+
+def test_an_asset_without_photographs_is_whole(tmp_path, capsys):
+    """As who hands it on takes out what tells where they lie."""
+    (tmp_path / "scan").mkdir()
+    assert main(["farm", str(tmp_path / "scan"), "-o", str(tmp_path / "farm"), "-q"]) == 0
+    results = Results(tmp_path / "farm/results")
+    asset = results.asset("scan")
+    make_asset(asset)
+    stamp = stamp_of("ingest", {}, {})
+    outputs = {"layers/photographs.usdc": "0" * 64}
+    write_stamp(stamp_path(asset, 1, "ingest"), replace(stamp, outputs=outputs))
+    write_record(results.record("scan"), Record(status="good", objects=3, measured=2))
+    assert main(["farm-table", str(tmp_path / "farm"), "-q"]) == 0
+    (asset / "map.exr").unlink()
+    assert main(["farm-table", str(tmp_path / "farm"), "-q"]) == 4
+
+
+def test_a_published_version_in_the_place_of_an_asset_is_known_by_its_manifest(tmp_path, capsys):
+    (tmp_path / "scan").mkdir()
+    assert main(["farm", str(tmp_path / "scan"), "-o", str(tmp_path / "farm"), "-q"]) == 0
+    results = Results(tmp_path / "farm/results")
+    asset = Asset.at(results.asset("scan"))
+    root = asset._published_root
+    root.parent.mkdir(parents=True)
+    root.touch()
+    assert asset.is_published
+    files = {root.relative_to(asset.folder).as_posix(): "0" * 64}
+    said = Manifest(
+        name="scan", version="v001", identifier="", texture_space="", photographs=False,
+        content="", files=files,
+    )  # fmt: skip
+    write_manifest(asset.folder, said)
+    write_record(results.record("scan"), Record(status="good", objects=3, measured=2))
+    words = ["farm-table", str(tmp_path / "farm"), "--json"]
+    assert main(words) == 0
+    write_manifest(asset.folder, replace(said, files=files | {"layers/scan.usdc": "0" * 64}))
+    capsys.readouterr()
+    assert main(words) == 4
+    told = checked(capsys.readouterr().out, "farm-table")["scans"][0]["sentence"]
+    gone = f"{asset.folder}/layers/scan.usdc"
+    assert told == f"{gone}: is gone. Bring it back from a copy. [farm.asset]"
+    (asset.folder / "manifest.json").write_text("{}")
+    assert main(words) == 4
+    assert "[publish.manifest]" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("code", [0, 1, 2, 3, 4, 5, 7])

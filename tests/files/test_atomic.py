@@ -13,6 +13,7 @@ import socket
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -378,3 +379,34 @@ def test_a_copy_that_does_not_fit_names_its_place_and_the_limit(tmp_path):
             shutil.copyfile(source, scratch)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_asking_whether_a_process_lives_does_nothing_to_it(monkeypatch):
+    # A shell may have told its children to overlook that it hung up.
+    waits = (
+        "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL); print(flush=True); input()"
+    )
+    command = [sys.executable, "-c", waits]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
+        assert atomic._is_in_use("x", str(other.pid))
+        time.sleep(0.2)
+        assert other.poll() is None
+        other.communicate(b"\n")
+    assert not atomic._is_in_use("x", str(other.pid))
+    assert not atomic._is_in_use("x", "9" * 30)
+    monkeypatch.setattr(atomic, "_own", {"ours"})
+    assert atomic._is_in_use("ours", str(os.getpid()))
+    assert not atomic._is_in_use("another", str(os.getpid()))
+
+    def forbidden(process, signal):
+        raise PermissionError
+
+    monkeypatch.setattr(os, "kill", forbidden)
+    assert atomic._is_in_use("x", "1")
+
+
+def test_flushing_a_folder_leaves_nothing_open(tmp_path):
+    before = len(os.listdir("/proc/self/fd"))
+    atomic.flush_folder(tmp_path)
+    assert len(os.listdir("/proc/self/fd")) == before

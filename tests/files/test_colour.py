@@ -8,6 +8,7 @@ import pytest
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files import colour
 from usdbrdf.files.colour import (
+    encoding_of_tag,
     kind_of_encoding,
     known_encodings,
     to_display_srgb8,
@@ -132,3 +133,28 @@ def test_a_name_that_is_nearly_right_is_told():
     assert "'ARRI LogC4'" in unknown_encoding("ARRI LogC5")
     assert kind_of_encoding("Raw") is None
     assert kind_of_encoding("sRGB - Display") is None
+
+
+# x, y of red, green, blue and white, from the standards' texts: IEC 61966-2-1 and ITU-R BT.709,
+# SMPTE EG 432-1, ITU-R BT.2020, SMPTE ST 2065-1, Academy S-2014-004, Adobe RGB (1998).
+D65, ACES_WHITE = (0.3127, 0.3290), (0.32168, 0.33767)
+PRIMARIES = {
+    "lin_rec709_scene": (0.640, 0.330, 0.300, 0.600, 0.150, 0.060, *D65),
+    "lin_p3d65_scene": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *D65),
+    "lin_rec2020_scene": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *D65),
+    "lin_ap0_scene": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.0770, *ACES_WHITE),
+    "lin_ap1_scene": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, *ACES_WHITE),
+    "lin_adobergb_scene": (0.640, 0.330, 0.210, 0.710, 0.150, 0.060, *D65),
+}
+
+
+@pytest.mark.parametrize("encoding", PRIMARIES)
+def test_primaries_name_their_space_if_all_are_right_to_two_thousandths(encoding):
+    places = np.array(PRIMARIES[encoding])
+    assert encoding_of_tag("", tuple(places)) == encoding
+    for k in range(8):
+        for off, found in ((0.0019, encoding), (-0.0019, encoding), (0.0021, None)):
+            near = places.copy()
+            near[k] += off
+            assert encoding_of_tag("", tuple(near)) == found
+    assert encoding_of_tag("", ()) is None

@@ -42,7 +42,12 @@ def test_numbers_that_are_not_finite(read, number):
 
 @pytest.mark.fault("C13")
 @pytest.mark.parametrize(
-    "text", ['{"a": 1,\n"b": {"a": 2},\n"a": 3}', '[{"x": []},\n{"a": {"b": 1},\n"\\u0061": 3}]']
+    "text",
+    [
+        '{"a": 1,\n"b": {"a": 2},\n"a": 3}',
+        '[{"x": []},\n{"a": {"b": 1},\n"\\u0061": 3}]',
+        '{"a": 1, "x": {"b": 1},\n"b": {"c": [{"b": 2}], "d": 3}, "d": 1,\n"a": 3}',
+    ],
 )
 def test_key_twice(read, text):
     with pytest.raises(InputRefused, match=r"doc\.json:3: the key 'a' .+\[document\.duplicate\]$"):

@@ -22,6 +22,7 @@ from usdbrdf.files.images import (
     kind_of_colours,
     read_exr,
     read_radiance,
+    resized,
     write_exr,
     write_preview_png,
 )
@@ -71,6 +72,17 @@ def test_equal_pixels_give_equal_bytes(tmp_path, radiance):
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
     assert b"2000:01:01" in (tmp_path / "a.exr").read_bytes()
     assert b"lin_rec709_scene" in (tmp_path / "a.exr").read_bytes()
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_at_another_size_a_pixel_is_the_mean_of_what_it_covers(channels):
+    pixels = np.random.default_rng(3).random((4, 9, channels)).astype(np.float32)
+    found = resized(pixels, 3, 2)
+    assert found.dtype == np.float32
+    blocks = pixels.reshape(2, 2, 3, 3, channels).mean(axis=(1, 3))
+    np.testing.assert_allclose(found, blocks, rtol=1e-5)
+    larger = resized(pixels[::2, ::3], 6, 4)
+    np.testing.assert_allclose(larger, pixels[::2, ::3].repeat(2, axis=0).repeat(2, axis=1))
 
 
 @pytest.mark.fault("I14")

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 from pathlib import Path
 
 import pytest
 
 from usdbrdf.capture.formats.named_pictures import path_in_capture
-from usdbrdf.errors import InputRefused, OwnershipConflict
-from usdbrdf.files.paths import contained, files_below, inside
+from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict
+from usdbrdf.files.paths import contained, files_below, inside, seen_of
+from usdbrdf.files.tables import beginning_of, files_of
 from usdbrdf.options import IngestOptions
 
 
@@ -140,3 +144,35 @@ def test_what_is_left_out_of_a_folder_is_however_both_are_named(way, tmp_path, m
     folder = Path("room") if way == "relative" else tmp_path / "link"
     assert files_below(folder, without=folder / "own") == [folder / "a.json"]
     assert files_below(folder, without=tmp_path / "room" / "own") == [folder / "a.json"]
+
+
+def test_what_systems_leave_beside_files_is_not_seen(tmp_path):
+    for name in (".DS_Store", "._a.ply", ".hidden", "Thumbs.db", "b.ply", "a.ply", "a.b.ply"):
+        (tmp_path / name).touch()
+    assert [p.name for p in seen_of(tmp_path.iterdir())] == ["a.b.ply", "a.ply", "b.ply"]
+    assert files_of(tmp_path, [".ply"]) == seen_of(tmp_path.iterdir())
+    # Who names one means it.
+    assert files_of(tmp_path / "._a.ply", [".ply"]) == [tmp_path / "._a.ply"]
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO, errno.ENOSPC])
+def test_a_glance_that_the_machine_denies_is_no_empty_file(tmp_path, monkeypatch, number):
+    file = tmp_path / "a.xml"
+    file.write_bytes(b"<chunk")
+    assert beginning_of(file) == b"<chunk"
+
+    def denied(*_, **__):
+        raise OSError(number, os.strerror(number), str(file))
+
+    monkeypatch.setattr(Path, "open", denied)
+    with pytest.raises(EnvironmentFailure, match=re.escape(str(file))):
+        beginning_of(file)
+
+
+def test_a_glance_that_a_file_denies_sees_nothing(tmp_path, monkeypatch):
+    def denied(*_, **__):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    (tmp_path / "a.xml").write_bytes(b"<chunk")
+    monkeypatch.setattr(Path, "open", denied)
+    assert beginning_of(tmp_path / "a.xml") == b""

@@ -94,3 +94,9 @@ def test_what_is_not_gamma_corrected_is_radiance(tmp_path: Path, said: bytes):
 def test_what_is_gamma_corrected_is_refused(tmp_path: Path, said: bytes):
     with pytest.raises(ImageRefused, match=r"states GAMMA=.*no radiance.*\[image.gamma\]"):
         factors_of_hdr(hdr(tmp_path, said))
+
+
+@pytest.mark.parametrize("said", [b"0", b"-2.2", b"nan", b"inf", b"-inf", b"1e999"])
+def test_a_gamma_that_nothing_can_be_corrected_by_is_told_as_such(tmp_path: Path, said: bytes):
+    with pytest.raises(ImageRefused, match=r"which nothing can be corrected by.*\[image.gamma\]"):
+        factors_of_hdr(hdr(tmp_path, b"GAMMA=" + said))

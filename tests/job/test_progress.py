@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
 from usdbrdf.job import progress as module
-from usdbrdf.job.progress import progress, say, set_quiet
+from usdbrdf.job.progress import progress, say, set_quiet, warn
 
 
 @pytest.fixture(autouse=True)
@@ -55,6 +57,25 @@ def test_names_cannot_command_the_terminal(capsys):
     assert capsys.readouterr().err == "chair \\x1b[2J\\u202e椅子\n"
 
 
+def test_what_is_said_is_one_line_whatever_it_quotes(capsys):
+    say("a\nb.exr: gone\r\x1b[31m")
+    warn("'a\nwarning: all is well': gone")
+    assert capsys.readouterr().err.splitlines() == [
+        "a\\nb.exr: gone\\r\\x1b[31m",
+        "warning: 'a\\nwarning: all is well': gone",
+    ]
+
+
+def test_warnings_are_told_by_one_function():
+    package = Path(module.__file__).parents[1]
+    begun = [
+        file.relative_to(package).as_posix()
+        for file in sorted(package.rglob("*.py"))
+        if re.search(r"(say|tell)\(\s*f?\"warning: ", file.read_text("utf-8"))
+    ]
+    assert begun == ["job/progress.py"]
+
+
 def test_quiet(capsys):
     set_quiet(True)
     say("hello")
@@ -80,3 +101,51 @@ os.write(file, str(file).encode())
         [*call, str(tmp_path / "file")], env={**os.environ, "PYTHONPATH": search}, check=True
     )
     assert int((tmp_path / "file").read_text()) > 2
+
+
+class _Output:
+    """A stdout that fails, with a descriptor to send what is left nowhere by."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        self._file, self._error = path.open("w"), error
+
+    def write(self, text: str) -> None:
+        raise self._error
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_reader_who_goes_away_has_seen_enough_unless_it_needs_the_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: bool
+):
+    gone = _Output(tmp_path / "gone", BrokenPipeError())
+    monkeypatch.setattr(sys, "stdout", gone)
+    if whole:
+        with pytest.raises(UsdBrdfError, match=r"its reader went away.*environment\.output"):
+            module.show("table", whole=True)
+    else:
+        module.show("table")
+    os.write(gone.fileno(), b"what is left")
+    assert (tmp_path / "gone").read_bytes() == b""
+    gone.close()
+    full = _Output(tmp_path / "full", OSError(28, "No space left on device"))
+    monkeypatch.setattr(sys, "stdout", full)
+    with pytest.raises(EnvironmentFailure, match=r"cannot be written \(No space left"):
+        module.show("table", whole=whole)
+    full.close()
+    monkeypatch.setattr(sys, "stdout", None)
+    if whole:
+        with pytest.raises(EnvironmentFailure, match=r"stdout is closed"):
+            module.show("table", whole=True)
+    else:
+        module.show("table")
+
+
+def test_lines_to_stdout_are_there_at_once(capsys: pytest.CaptureFixture[str]):
+    module.show("one\ntwo")
+    assert capsys.readouterr() == ("one\ntwo\n", "")

@@ -14,7 +14,7 @@ from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, 
 from usdbrdf.job import arithmetic as arithmetic_module
 from usdbrdf.job import stamp as stamp_module
 from usdbrdf.job import task as task_module
-from usdbrdf.job.task import run_task
+from usdbrdf.job.task import TaskRun, run_task
 
 STAMP = ".usdbrdf/stamps/20-toy.json"
 
@@ -435,3 +435,28 @@ def test_blas_keeps_to_one_thread_in_the_work(tmp_path):
         run_task(tmp_path / "room", "toy", order=20, parameters={}, inputs={}, work=work)
         assert told == [{1}]
         assert _threads_of_blas() == {2}
+
+
+def test_states_are_saved_every_two_seconds_or_thirty_times_what_saving_takes(
+    tmp_path, monkeypatch
+):
+    run = TaskRun(tmp_path, "toy", tmp_path / "work")
+    saved, now, takes = [], 100.0, 0.0
+
+    def save(key, index, arrays):
+        nonlocal now
+        now += takes
+        saved.append((key, index, arrays))
+
+    monkeypatch.setattr(task_module.time, "monotonic", lambda: now)
+    monkeypatch.setattr(run, "save_latest", save)
+    run._saved = now, 0.0
+    for wait, seconds, index in (
+        (1.9, 0.0, None), (0.1, 0.5, 1), (14.9, 0.5, None), (0.1, 0.01, 3), (1.9, 9.0, None),
+        (0.1, 0.0, 5),
+    ):  # fmt: skip
+        now, takes = now + wait, seconds
+        before = len(saved)
+        run.save_latest_in_time("sum", index or 0, lambda: {"made": "once"})
+        assert len(saved) - before == (index is not None)
+    assert saved == [("sum", index, {"made": "once"}) for index in (1, 3, 5)]

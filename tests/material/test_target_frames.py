@@ -11,10 +11,12 @@ from usdbrdf.material.fit_target import (
     FrameCounts,
     choose_target_frames,
     count_frame,
+    frame_samples,
     mirror_hits_emitter,
     object_pixels,
+    seen_in_frame,
 )
-from usdbrdf.transport.lit_scene import LitScene, visible_points
+from usdbrdf.transport.lit_scene import LitScene, View, visible_points
 
 WIDTH, HEIGHT = 80, 60
 LENS = np.array([60.0, 60.0, 40.0, 30.0])
@@ -156,3 +158,35 @@ def test_half_of_a_limited_number_of_pixels_lies_by_the_highlight():
     number = (np.hypot(row - 55, column - 75) <= 30).sum()
     assert stands_for[near].sum() == pytest.approx(number, rel=1e-5)
     assert stands_for[~near].sum() == pytest.approx(len(whole) - number, rel=1e-5)
+
+
+def test_a_pixel_is_the_mean_over_its_quarters(world: World, pose: np.ndarray):
+    """Of a floor whose radiance rises evenly, as much as in the pixel's middle."""
+    x, y, _ = world.texels.position.T.astype(np.float64)
+    radiance = np.stack([4 + x, 4 - y, 5 + x + y], axis=-1).astype(np.float32)
+    emits = world.per_object([(0, 0, 0), (1, 1, 1)])
+    lit = world.lit(radiance, emission=emits)
+    camera = camera_at(pose, LENS, WIDTH, HEIGHT)
+    shown = np.random.default_rng(2).random((HEIGHT, WIDTH, 3)).astype(np.float32)
+    view = View(camera=camera, radiance=shown, valid=np.ones((HEIGHT, WIDTH), bool))
+    samples, number = frame_samples(lit, view, seen_in_frame(lit, view), 0, 300, 1)
+    assert samples is not None
+    assert number == len(samples.diffuse) == len(samples.stands_for) > 200
+    # Which pixels these are is told by what they show.
+    place = {tuple(rgb): k for k, rgb in enumerate(shown.reshape(-1, 3).tolist())}
+    pixel = np.array([place[tuple(rgb)] for rgb in samples.observed.tolist()])
+    middle = visible_points(lit, camera, camera.pixels()).position[pixel].astype(np.float64)
+    inside = (np.abs(middle[:, :2]).max(axis=1) < 2.5) & (middle[:, 1] < 0.5)  # and near
+    assert inside.sum() > 100
+    x, y, _ = middle[inside].T
+    wanted = np.stack([4 + x, 4 - y, 5 + x + y], axis=-1)
+    # Perspective bends a few; a quarter of a pixel to one side would be 4e-3 on the mean.
+    off = samples.diffuse[inside] - wanted
+    np.testing.assert_allclose(off, 0, atol=4e-3)
+    np.testing.assert_allclose(off.mean(axis=0), 0, atol=5e-4)
+    level = samples.diffuse.mean(axis=1, keepdims=True)
+    weight = (level + 0.1 * np.median(level)) ** -2
+    np.testing.assert_allclose(samples.weight(), weight, rtol=1e-5)
+    few, some = frame_samples(lit, view, seen_in_frame(lit, view), 0, 5, 1)
+    assert few is None
+    assert some <= 5

@@ -10,6 +10,7 @@ import pytest
 from usdbrdf.material.verdict import (
     MAX_PHI_ERROR,
     MAX_PSI_ERROR,
+    MODEL_DISCREPANCY,
     MOST_CONTRADICTED,
     MOST_OF_MEASURED,
     NEUTRAL,
@@ -20,6 +21,7 @@ from usdbrdf.material.verdict import (
     _deviation,
     _quantiles,
     _vertex,
+    averaged,
     least_costs,
     lobe_from_costs,
     verdict_on_frame,
@@ -239,3 +241,37 @@ def test_psi_of_the_least_cost_is_the_ratio_of_its_terms_between_none_and_all():
     assert cost == pytest.approx([5 - 0.25, 5 - 12 + 4, 5, 5])
     assert square == pytest.approx([4, 4, 4, 5e-12])
     assert least_costs(terms, 0.1)[2][3] == pytest.approx(1e-12)
+
+
+def test_models_that_fit_alike_are_averaged_and_what_they_differ_by_is_an_error():
+    """One with a weight of a quarter that finds 0.4 more: sqrt(3 / 16) of that, beside its own."""
+    one = LobeEstimate(
+        phi=0.2, psi=0.3, phi_error=0.06, psi_error=0.03, unresolved=0.02, cost=2.0, evidence=0.6,
+        of_rays=(0.01, 0.02), phi_median=0.25, psi_median=0.35, psi_upper=0.5,
+    )  # fmt: skip
+    other = one._replace(
+        phi=0.3, psi=0.34, phi_error=0.02, unresolved=0.1, of_rays=(0.05, 0.1), psi_upper=0.9
+    )
+    found = averaged([one, other], 100, [3, 1])
+    assert found.phi == pytest.approx(0.225)
+    assert found.psi == pytest.approx(0.31)
+    phi_error = math.sqrt((3 * 0.06**2 + 0.02**2) / 4 + 3 / 16 * 0.1**2)
+    assert found.phi_error == pytest.approx(phi_error)
+    assert found.psi_error == pytest.approx(math.sqrt(0.03**2 + 3 / 16 * 0.04**2))
+    assert found.unresolved == pytest.approx(0.04)
+    assert found.psi_upper == pytest.approx(0.6)
+    assert (found.phi_median, found.psi_median) == pytest.approx((0.25, 0.35))
+    assert found.of_rays == pytest.approx((0.02, 0.04))
+    # Far apart nothing is known, and no less than that.
+    apart = [one._replace(phi=phi, phi_error=0.2) for phi in (0.0, 1.0)]
+    assert averaged(apart, 100, [1, 1]).phi_error == NOTHING_KNOWN
+    # A cost that is larger by twice the unit, in all, counts e times less; the best one's stands.
+    unit = max(1.0, MODEL_DISCREPANCY * 200)
+    worse = other._replace(cost=2.0 + 2 * unit / 100, evidence=0.1)
+    told = averaged([worse, one], 100, [1, 1])
+    assert told.phi == pytest.approx((0.2 * math.e + 0.3) / (math.e + 1))
+    assert (told.cost, told.evidence) == (2.0, 0.6)
+    # Of less than one degree of freedom there is none.
+    assert averaged([worse, one], 0, [1, 1]).phi == pytest.approx(
+        (0.2 + 0.3 * math.exp(-unit / 100)) / (1 + math.exp(-unit / 100))
+    )

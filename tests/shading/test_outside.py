@@ -12,7 +12,8 @@ from tests.scenes import frames_at, look_at
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading import outside, sky_patches
 from usdbrdf.shading.asked import Shining, asked_texels, irradiance_of_texels
-from usdbrdf.shading.outside import Outside, light_from_outside
+from usdbrdf.shading.outside import Outside, _sun_shines, _Told, light_from_outside
+from usdbrdf.shading.outside_light import Asked, Solution, Sources
 from usdbrdf.shading.sun_direction import with_disc
 from usdbrdf.shading.surroundings import HEIGHT, WIDTH, Surroundings
 from usdbrdf.shading.unseen_lamps import lamps_that_explain
@@ -137,6 +138,39 @@ def test_sun_and_sky_are_found_by_the_light_that_they_cast(sunny, clips: bool):
     np.testing.assert_array_equal(found.environment.image[known], SKY[known])
     np.testing.assert_array_equal(found.confidence, known.astype(np.float32))
     assert 0.2 < found.open_share < 0.7
+
+
+@pytest.mark.parametrize(
+    ("strength", "error", "shines"),
+    [(10.0, 0.9, True), (10.0, 1.5, False), (0.5, 0.9, False), (0.5, 0.45, True)],
+)
+def test_a_strong_sun_need_not_be_known_as_well_as_a_weak_one(strength, error, shines):
+    # On a half of the texels, beside light of 1 from elsewhere.
+    number, ones = 80, np.ones((80, 3))
+    asked = Asked(
+        texel=np.arange(number),
+        segment=np.zeros(number, np.int32),
+        owner=np.zeros(number, np.int32),
+        reflected=ones,
+        clipped=np.zeros(number, np.bool_),
+        irradiance=ones,
+        mirrored=0 * ones,
+    )
+    share = np.repeat([0.0, 1.0], number // 2)[None]
+    sources = Sources(
+        share=share,
+        mean=np.zeros((1, 3)),
+        deviation=np.ones(1),
+        family=np.zeros(1, np.int64),
+        pairs=np.zeros((0, 2), np.int64),
+        apart=np.zeros(0),
+    )
+    found = Solution(
+        np.full((1, 3), np.log(strength)), np.zeros((1, 3)), np.zeros(3), np.zeros((1, 3))
+    )
+    in_shade = sources._replace(share=share[:0], mean=np.zeros((0, 3)))
+    told = _Told(asked, in_shade, SUN, (asked, sources), found)
+    assert _sun_shines(told, np.full((1, 3), error)) == shines
 
 
 def test_what_surfaces_mirror_is_not_taken_for_light_in_their_shadows(sunny):

@@ -72,3 +72,42 @@ def test_a_wrong_prior_pulls_what_texels_do_not_tell():
     even[1] = 1e-3
     sources = sources._replace(share=even)
     assert (pull_of_prior(asked, sources, solved(asked, sources))[1] > 1).all()
+
+
+def test_what_little_light_of_the_dark_is_not_known_does_not_dim_a_lamp():
+    # Of each wall a part lies in the dark, another in the light of other walls, and the rest in the
+    # lamp's as well; everywhere some light of which nobody knows, a fiftieth of all on the mean.
+    random, number = np.random.default_rng(5), 90
+    segment = np.repeat(np.arange(8, dtype=np.int32), number)
+    place = np.tile(np.arange(number), 8)
+    dark, lit = place < 30, place >= 60
+    known = np.where(dark, 0.02, random.uniform(0.5, 1.5, len(segment)))
+    share = np.where(lit, random.uniform(0.02, 0.06, len(segment)), 0)[None]
+    light = known + 40 * share[0]
+    stray = 0.02 * light.mean()
+    albedo = random.uniform(0.2, 0.7, 8)[segment]
+    texture = np.exp(0.1 * random.standard_normal(len(segment)))
+    asked = Asked(
+        texel=np.arange(len(segment)),
+        segment=segment,
+        owner=segment,
+        reflected=np.repeat((albedo * (light + stray) * texture)[:, None], 3, axis=1),
+        clipped=np.zeros(len(segment), np.bool_),
+        irradiance=np.repeat(known[:, None], 3, axis=1),
+        mirrored=np.zeros((len(segment), 3)),
+    )
+    sources = Sources(
+        share=share,
+        mean=np.zeros((1, 3)),
+        deviation=np.array([3.0]),
+        family=np.zeros(1, np.int64),
+        pairs=np.zeros((0, 2), np.int64),
+        apart=np.zeros(0),
+    )
+
+    def off(stray: float) -> float:
+        found = solved(asked, sources._replace(stray=stray))
+        return float(np.abs(found.log_radiance[0] - np.log(40)).max())
+
+    assert off(0.04) < 0.1
+    assert off(0.0) > 2 * off(0.04)

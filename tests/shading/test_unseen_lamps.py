@@ -15,6 +15,7 @@ from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading import shaded
 from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
+from usdbrdf.shading.lamp_light import known_well, looked_at_closely
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved
 from usdbrdf.shading.shaded import find_emitters
 from usdbrdf.shading.unseen_lamps import UnseenLamps, lamps_that_explain
@@ -246,6 +247,34 @@ def test_what_a_person_says_of_one_says_nothing_of_another(hall, monkeypatch):
     assert LAMP not in found.object
     # What hardly anything is known of is no lamp all the same.
     assert (found.error < 1).all()
+
+
+def test_what_brings_most_of_the_light_need_not_be_known_as_well_as_what_brings_little():
+    # At the same error of 0.4: with half of the light S errs by 0.2 in place of log 2 without it.
+    part, error = np.array([1e-3, 0.2, 0.5, 0.73, 0.9]), 0.4
+    with_it, without = part * error, np.log(1 / (1 - part))
+    np.testing.assert_allclose((with_it / without)[[0, 2]], [0.4, 0.2 / np.log(2)], rtol=1e-3)
+    known = known_well(np.full(5, error), part, 0.3)
+    np.testing.assert_array_equal(known, with_it / without < 0.3)
+    assert known.tolist() == [False, False, True, True, True]
+    assert known_well(np.array([0.25, 3.0]), np.array([0.0, 1.0]), 0.3).all()
+    assert not known_well(np.array([np.inf]), np.array([1.0]), 0.3).any()
+
+
+@pytest.mark.parametrize(("part", "error", "shines"), [(0.8, 0.5, True), (0.2, 0.5, False)])
+def test_a_lamp_is_believed_by_how_much_of_the_light_is_its_own(
+    hall, monkeypatch, part, error, shines
+):
+    surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
+
+    def badly_known(*given):
+        found = looked_at_closely(*given)
+        number = len(found.error)
+        return found._replace(error=np.full(number, error), part=np.full(number, part))
+
+    monkeypatch.setattr("usdbrdf.shading.unseen_lamps.looked_at_closely", badly_known)
+    found = lamps_that_explain(surface, lit, coverage, FRAMES, DARK, 0)
+    assert (LAMP in found.object) == shines
 
 
 def test_what_only_reflects_is_none(hall):

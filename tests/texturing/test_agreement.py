@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.scenes import edited, make_capture
+from tests.scenes import camera_at, edited, make_capture
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_weaker
@@ -16,13 +17,18 @@ from usdbrdf.capture.adapters import read_scan
 from usdbrdf.cli import main
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr, write_exr
+from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.options import IngestOptions
 from usdbrdf.texturing.agreement import (
+    MIN_COSINE,
     Agreement,
+    MeshPoints,
     agreement,
+    is_doubtful,
     logarithms_in_frame,
     other_convention,
     points_of_surface,
+    seen_points,
 )
 from usdbrdf.transport.rays import RayScene
 
@@ -149,3 +155,121 @@ def test_what_is_stated_is_believed_unless_asked(capture):
     np.testing.assert_allclose(
         2 * read_frame(twice, 0).radiance, read_frame(scan.frames, 0).radiance
     )
+
+
+def _in_three_frames(points: int, off: float) -> np.ndarray:
+    """Logarithms around 1 and -1, of which two frames are off by so much, either way."""
+    level = np.where(np.arange(points) % 2, 1.0, -1.0)
+    return (level[:, None] + np.array([off, -off, 0])).astype(np.float32)
+
+
+def test_agreement_is_how_far_frames_are_off_the_others_as_a_share_of_all_contrast():
+    """Of three samples each lies nearer to their median by sqrt(2 / 3) than to the truth."""
+    shown = _in_three_frames(200, 0.06)
+    found = agreement(shown)
+    assert found is not None
+    assert found.samples == 600
+    assert found.scatter == pytest.approx(0.04 * math.sqrt(1.5), rel=1e-5)
+    assert found.ratio == pytest.approx(found.scatter, rel=1e-5)
+    # Twice the contrast is half of the share, and one unit is as good as another.
+    again = agreement(2 * shown + 7)
+    assert again is not None
+    assert again.scatter == pytest.approx(2 * found.scatter, rel=1e-4)
+    assert again.ratio == pytest.approx(found.ratio, rel=1e-4)
+    # Points that one frame alone shows say nothing.
+    lonely = np.full((300, 3), np.nan, np.float32)
+    lonely[:, 1] = 50
+    assert agreement(np.concatenate([shown, lonely])) == found
+
+
+def test_some_frames_are_judged_by_all():
+    shown = _in_three_frames(600, 0.06)
+    for judged, scatter in (
+        ([True, False, False], 0.06), ([False, False, True], 0), ([True, False, True], 0.03),
+    ):  # fmt: skip
+        found = agreement(shown, np.array(judged))
+        assert found is not None
+        assert found.samples == 600 * sum(judged)
+        assert found.scatter == pytest.approx(scatter * math.sqrt(1.5), rel=1e-5, abs=1e-7)
+    assert agreement(shown[:166]) is None
+    assert agreement(shown[:167]) is not None
+    assert agreement(shown[:499], np.array([True, False, False])) is None
+
+
+def test_another_reading_must_be_clearly_better_good_and_see_as_much():
+    def of(ratio: float, samples: int = 1000) -> Agreement:
+        return Agreement(0.1, ratio, samples)
+
+    given = of(0.9)
+    assert is_doubtful(given)
+    assert is_doubtful(None)
+    assert is_doubtful(of(0.66))
+    assert not is_doubtful(of(0.64))
+    others = {"a": of(0.3), "b": of(0.04, 499), "c": None, "d": of(0.1, 500)}
+    assert other_convention(given, others) == "d"
+    assert other_convention(None, {"b": of(0.04, 249), "d": of(0.1, 250)}) == "d"
+    for told, ratio, named in ((given, 0.53, "a"), (given, 0.55, ""), (None, 0.59, "a")):
+        assert other_convention(told, {"a": of(ratio), "c": None}) == named
+    assert other_convention(of(1.2), {"a": of(0.64)}) == "a"
+    assert other_convention(of(1.2), {"a": of(0.66)}) == ""
+    assert other_convention(of(0.02), others) == ""
+    assert other_convention(given, {}) == ""
+
+
+def test_points_are_even_over_a_mesh_by_area():
+    """Of two triangles of 1 1/2 and 1/2 m^2, the smaller one turned to the side."""
+    points = np.array([[0, 0, 0], [3, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 1]], np.float32)
+    mesh = ScanMesh(
+        points=points, triangles=np.array([[0, 1, 2], [0, 4, 3]], np.int32),
+        corner_normals=np.zeros((2, 3, 3), np.float32), face_object=np.array([4, 2], np.int32),
+    )  # fmt: skip
+    found = points_of_surface(mesh, 4000)
+    large = found.owner == 4
+    assert set(found.owner.tolist()) == {2, 4}
+    assert abs(large.sum() - 3000) < 4 * math.sqrt(4000 * 3 / 16)
+    np.testing.assert_allclose(found.normal[large], np.tile([0.0, 0, 1], (large.sum(), 1)))
+    np.testing.assert_allclose(np.abs(found.normal[~large, 0]), 1)
+    x, y, z = found.point[large].T
+    assert ((x >= 0) & (y >= 0) & (x / 3 + y <= 1 + 1e-9) & (z == 0)).all()
+    # The mean is the middle, and each of three corners has a ninth of the points beside it.
+    middle, error = np.array([x.mean() / 3, y.mean()]), 4 * math.sqrt(1 / 18 / 3000)
+    np.testing.assert_allclose(middle, 1 / 3, atol=error)
+    for part in (x / 3 > 2 / 3, y > 2 / 3, x / 3 + y < 1 / 3):
+        assert part.mean() == pytest.approx(1 / 9, abs=4 * math.sqrt(8 / 81 / 3000))
+    again = points_of_surface(mesh, 4000)
+    np.testing.assert_array_equal(again.point, found.point)
+
+
+def test_a_camera_sees_what_faces_it_within_its_picture_and_is_not_hidden():
+    """From 2 above a floor; a board of half its width 0.6 above it."""
+    points = np.array(
+        [[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0], [0, -9, 0.6], [9, -9, 0.6], [9, 9, 0.6],
+         [0, 9, 0.6]], np.float32,
+    )  # fmt: skip
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
+    rays = RayScene(points, triangles)
+    pose = np.eye(4)
+    pose[2, 3] = 2
+    camera = camera_at(pose, np.array([20.0, 20, 16, 12]), 32, 24)
+    # A pixel is 0.1 wide on the floor: x from -1.6, y from 1.2 downwards.
+    place = [
+        (-0.55, 0.25, 0), (-1.45, 0, 0), (-1.55, 0, 0), (-0.5, 1.05, 0), (-0.5, 1.15, 0),
+        (-0.5, -1.05, 0), (-0.5, -1.15, 0), (0.5, 0.05, 0), (0.5, 0.05, 0.6), (0.5, 0.05, 0.594),
+        (0.5, 0.05, 0.585), (0, 0, 3),
+    ]  # fmt: skip
+    normal = np.tile([0.0, 0, 1], (len(place), 1))
+    surface = MeshPoints(np.array(place, np.float64), normal, np.zeros(len(place), np.int32))
+    seen, column, row = seen_points(surface, rays, camera)
+    # What lies behind the board by less than a half per cent of the way passes for the board.
+    assert np.flatnonzero(seen).tolist() == [0, 1, 3, 5, 8, 9]
+    assert (column[0], row[0]) == (10, 9)
+    assert (column[1], row[2], row[3]) == (1, 1, 22)
+    assert not seen_points(surface._replace(normal=-normal), rays, camera)[0].any()
+    for cosine, visible in ((MIN_COSINE * 1.02, True), (MIN_COSINE * 0.98, False)):
+        way = np.array([0.0, 0, 2]) - surface.point[0]
+        way /= np.linalg.norm(way)
+        across = np.cross(way, [1.0, 0, 0])
+        across /= np.linalg.norm(across)
+        leaning = cosine * way + math.sqrt(1 - cosine**2) * across
+        tilted = surface._replace(normal=np.tile(leaning, (len(place), 1)))
+        assert seen_points(tilted, rays, camera)[0][0] == visible

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from usdbrdf.errors import InputRefused
-from usdbrdf.texturing.exposures import Probes, gains_of_frames
+from usdbrdf.model.capture import Frames
+from usdbrdf.texturing.exposures import (
+    Probes,
+    doubts_about_exposures,
+    gains_of_frames,
+    probed_texels,
+    surfaces_agree,
+    with_estimated_exposures,
+)
 from usdbrdf.texturing.exposures import contradicting_frames as contradicting_frames_of
 
 FRAMES, TEXELS = 40, 600
@@ -175,3 +183,109 @@ def test_probes_are_the_same_however_the_texels_are_grouped():
 
 def test_many_frames_take_no_more_memory():
     assert Probes.empty(1_000_000, 50_000).logarithm.nbytes <= 9 << 20
+
+
+def _same_for_all(gains: list[float]) -> np.ndarray:
+    """Logarithms of 30 texels that as many frames show, by their gains."""
+    level = np.linspace(-1, 3, 30)
+    return (level[:, None] + np.log(gains)).astype(np.float32)
+
+
+def test_exact_gains_are_found_exactly_and_samples_are_held_against_the_others():
+    logarithm = _same_for_all([1, 2, 0.5, 1, 1])
+    logarithm[:5, 4] = np.nan
+    logarithm[29] = np.nan
+    logarithm[29, 0] = 7  # of one frame alone
+    gains = gains_of_frames(logarithm)
+    np.testing.assert_allclose(np.exp(gains.logarithm), [1, 2, 0.5, 1, 1], rtol=2e-3)
+    np.testing.assert_allclose(gains.scatter, 0, atol=2e-3)
+    assert gains.samples.tolist() == [29, 29, 29, 29, 24]
+    wanted = np.broadcast_to(np.log([1, 2, 0.5, 1, 1]), (30, 5)).copy()
+    wanted[:5, 4] = wanted[29] = np.nan
+    np.testing.assert_allclose(gains.brighter, wanted, atol=4e-3)
+    # Frames that are not compared with enough others say nothing of what is usual.
+    logarithm[:6, 1:] = np.nan
+    few = gains_of_frames(logarithm)
+    assert few.samples.max() == 23
+    assert few.logarithm[1] - few.logarithm[0] == pytest.approx(np.log(2), abs=3e-3)
+
+
+def test_scatter_is_that_of_the_middle_half_and_a_highlight_changes_nothing():
+    logarithm = _same_for_all([1, 1, 1, 1, 1])
+    logarithm[:, 2] += np.where(np.arange(30) % 2, 0.05, -0.05)
+    logarithm[7, 1] += 3
+    gains = gains_of_frames(logarithm)
+    np.testing.assert_allclose(gains.logarithm, 0, atol=6e-3)
+    # The texel's mean takes a fifth of what is off.
+    assert gains.scatter[2] == pytest.approx(1.4826 * 0.05 * 4 / 5, rel=0.05)
+    assert gains.scatter[0] == pytest.approx(1.4826 * 0.05 / 5, rel=0.15)
+    assert gains.brighter[7, 1] == pytest.approx(3, rel=0.02)
+    assert gains.brighter[3, 2] == pytest.approx(0.05, rel=0.1)
+
+
+def _five(radiometric: bool, gain=None) -> Frames:
+    return Frames(
+        image_paths=tuple(Path(f"{i}.exr") for i in range(5)),
+        world_from_camera=np.tile(np.eye(4), (5, 1, 1)),
+        intrinsics=np.full((5, 4), 8.0),
+        resolution=np.full((5, 2), 16, np.int32),
+        exposure_time=np.array([1.0, 2, 3, 4, 5]),
+        saturation_radiance=np.full(5, 10.0),
+        noise_floor_radiance=np.full(5, 0.1),
+        gain=gain,
+        radiometric=radiometric,
+    )
+
+
+@pytest.mark.parametrize("radiometric", [True, False])
+def test_frames_are_taken_as_exposed_as_their_pixels_say(radiometric: bool):
+    logarithm = _same_for_all([1, 2, 0.5, 1, 4])
+    logarithm[:7, 4] = np.nan  # shares too little with the others
+    before = np.array([1.0, 1, 3, 1, 1]) if radiometric else None
+    changed, off = with_estimated_exposures(_five(radiometric, before), logarithm)
+    gain = np.array([1, 2, 0.5, 1, 1])
+    np.testing.assert_allclose(changed.exposure_time, np.array([1, 2, 3, 4, 5]) * gain, rtol=3e-3)
+    np.testing.assert_allclose(changed.saturation_radiance, 10 / gain, rtol=3e-3)
+    np.testing.assert_allclose(changed.noise_floor_radiance, 0.1 / gain, rtol=3e-3)
+    if radiometric:
+        np.testing.assert_allclose(changed.gain, gain * [1, 1, 3, 1, 1], rtol=3e-3)
+    else:
+        assert changed.gain is None
+    assert off == {"1.exr": 2.0, "2.exr": 0.5}
+    (said,) = doubts_about_exposures(off, 5, Path("a/room"))
+    assert said.startswith("room: 2 of 5 frames contradicted the others, 1.exr (2.00 x), 2.exr (0.")
+    assert not [*doubts_about_exposures({}, 5, Path("a/room"))]
+
+
+def test_surfaces_agree_where_two_thirds_of_them_are_off_by_half():
+    """Of 30 points on four surfaces, of which the last two are small: together they count as one,
+    and the first one that is off the other way not at all."""
+    owner = np.array([7] * 8 + [2] * 8 + [4] * 7 + [5] * 7)
+    gain = np.array([0.4, -0.4, 0.4, 0.4, 0.0, 0.4])
+    brighter = np.zeros((30, 6))
+    brighter[:, 0] = np.where(owner == 7, 0.05, 0.21)  # two of three
+    brighter[:, 1] = np.where(owner == 7, 0.3, -0.21)  # two of two
+    brighter[:, 2] = np.where(owner == 2, 0.21, 0.19)  # one of three
+    brighter[:, 3] = 0.4
+    brighter[:7, 3] = np.nan  # 23 points are too few
+    brighter[:, 4] = 0.4
+    brighter[:, 5] = -0.3  # none says anything
+    found = surfaces_agree(brighter, gain, owner)
+    assert found.tolist() == [True, True, False, False, False, False]
+    brighter[6, 3] = 0.4
+    assert surfaces_agree(brighter, gain, owner)[3]
+
+
+def test_every_so_many_texels_are_probed():
+    assert probed_texels(4096, 10).tolist() == list(range(4096))
+    assert probed_texels(4097, 10).tolist() == list(range(0, 4097, 2))
+    assert len(probed_texels(100, 1 << 15)) == 50  # 64 samples of as many frames each
+    probes = Probes.empty(4097, 3, slice(5, 12))
+    assert (probes.every, probes.first, probes.logarithm.shape) == (2, 3, (3, 3))
+    radiance = np.array([[1.0, 2, 3], [4, 4, 4], [0, 0, 0], [9, 9, 9]], np.float32)
+    probes.add(1, np.array([6, 7, 8, 10], np.int32), radiance)
+    np.testing.assert_allclose(probes.logarithm[:, 1], np.log([2, np.nan, 9]), rtol=1e-6)
+    assert np.isnan(probes.logarithm[:, [0, 2]]).all()
+    some = probes.of(slice(7, 11))
+    assert (some.every, some.first) == (2, 4)
+    np.testing.assert_array_equal(some.logarithm, probes.logarithm[1:3])

@@ -311,3 +311,18 @@ def test_beside_a_glaring_lamp_no_sample_is_taken():
     assert away[lost].max() < 4.6 * 1.5 / 80
     on_floor = glaring == SAMPLE
     assert (away[on_floor] > 2.5 * 1.5 / 80).all()
+
+
+def test_texels_in_the_outermost_pixels_give_nothing_and_all_others_do():
+    """Of a wall that fills the picture, straight before the camera."""
+    wall = world_of([quad((-1.1, -0.9, 0), (2.2, 0, 0), (0, 1.8, 0), size=(110, 90))])
+    pose = np.eye(4)
+    pose[2, 3] = 2
+    shot = _shoot(wall, np.ones((HEIGHT, WIDTH, 3)), pose)
+    column, row = _pixel_of(pose, wall.texels.position)
+    near = np.minimum(np.minimum(column, WIDTH - column), np.minimum(row, HEIGHT - row))
+    sure = np.abs(near - 1) > 1e-3
+    np.testing.assert_array_equal((shot.kind == SAMPLE)[sure], near[sure] > 1)
+    for side in (column, WIDTH - column, row, HEIGHT - row):
+        assert ((side > 1) & (side < 2) & (near == side)).any()
+        assert ((side > 0) & (side < 1) & (near == side)).any()

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from usdbrdf.asset.layout import Asset
+from usdbrdf.evaluation.evaluate_views import viewed_asset
 from usdbrdf.transport.environment import (
     Environment,
+    Sun,
     black_environment,
+    directions_of_pixels,
     environment_at,
+    pixels_of_directions,
+    solid_angles,
     unknown_primaries,
 )
 
@@ -91,3 +100,72 @@ def test_primaries_that_are_not_known_are_told(tmp_path, known: bool):
     assert output.close()
     said = unknown_primaries(path)
     assert said == "" if known else "sky.exr: the header says that its primaries" in said
+
+
+def test_who_looks_at_an_asset_in_a_light_of_unknown_primaries_is_told(tmp_path, capsys):
+    class Reached(Exception):
+        """The light is asked for."""
+
+    def environment(_: object) -> None:
+        raise Reached
+
+    sky = tmp_path / "sky.exr"
+    spec = oiio.ImageSpec(4, 2, 3, "float")
+    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), (0.6, *[0.3] * 7))
+    output = oiio.ImageOutput.create(str(sky))
+    assert output.open(str(sky), spec)
+    assert output.write_image(np.ones((2, 4, 3), np.float32))
+    assert output.close()
+    scene = SimpleNamespace(objects=[])
+    atlas: Any = SimpleNamespace(scene=scene, environment=environment, lit_scene=None)
+    for asked, told in ((sky, 1), ("none", 0)):
+        with pytest.raises(Reached):
+            viewed_asset(Asset.at(tmp_path), atlas, asked)
+        assert capsys.readouterr().err.count("sky.exr: the header says that its primaries") == told
+
+
+def test_pixels_cover_the_sphere_each_its_part_of_its_zone():
+    # Zones of a height h are 2 pi h: of three rows those from 90 to 30 degrees are a half high.
+    np.testing.assert_allclose(solid_angles(3, 4), np.array([0.5, 1, 0.5]) * 2 * np.pi / 4)
+    np.testing.assert_allclose(solid_angles(2, 5), 2 * np.pi / 5)
+    assert 8 * solid_angles(7, 8).sum() == pytest.approx(4 * np.pi)
+
+
+@pytest.mark.parametrize("z_up", [False, True])
+def test_a_pixel_looks_where_the_picture_is_looked_up(z_up: bool):
+    height, width = 6, 9
+    found = directions_of_pixels(height, width, z_up)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1)
+    every = found.reshape(-1, 3)
+    np.testing.assert_array_equal(
+        pixels_of_directions(every, height, width, z_up), np.arange(height * width)
+    )
+    image = _numbered(height, width)
+    assert [_pixel(image, z_up, tuple(w)) for w in every] == [
+        divmod(k, width) for k in range(height * width)
+    ]
+    # The first pixel: 75 degrees up, and 160 to the left of what is ahead.
+    up, left, ahead = np.sin(np.radians(75)), np.radians(160), np.cos(np.radians(75))
+    right, along = ahead * np.sin(left), ahead * np.cos(left)
+    wanted = (right, -along, up) if z_up else (right, up, along)
+    np.testing.assert_allclose(found[0, 0], wanted, atol=1e-12)
+
+
+def test_directions_at_the_ends_of_the_picture_fall_into_its_last_pixels():
+    ends = np.array([[0, -1.0000001, 0], [0, 1.0000001, 0], [-0.0, 0, -1], [0, 0, -1]])
+    down, up, right, left = pixels_of_directions(ends, 4, 6, False).tolist()
+    assert (down // 6, up // 6) == (3, 0)
+    assert (right, left) == (2 * 6 + 5, 2 * 6)
+
+
+def test_a_sun_is_one_that_sends_something_and_belongs_to_its_sky():
+    sky = Environment(_numbered(2, 4), True)
+    assert not sky.sun.shines
+    sun = Sun(np.array([0.0, 0.6, 0.8]), np.array([0, 0.5, 0]), 0.01)
+    assert sun.shines
+    under = sky.under(sun)
+    assert under.image is sky.image
+    assert under.z_up
+    assert (under.sun.half_angle, under.sun.direction.tolist()) == (0.01, [0, 0.6, 0.8])
+    assert under.sun.irradiance.tolist() == [0, 0.5, 0]
+    assert not black_environment().z_up

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, raise_shortage
-from usdbrdf.files.paths import refuse_nameless
-from usdbrdf.job.progress import say
+from usdbrdf.files.paths import refuse_nameless, seen_of
+from usdbrdf.job.progress import warn
 
 if TYPE_CHECKING:
     from usdbrdf.model.capture import Scan
@@ -174,7 +174,7 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
             if adapter.name in MODULES:
                 raise
             raise_shortage(error)
-            say(f"warning: adapter {adapter.name!r} is skipped: {error!r}. [adapter.matches]")
+            warn(f"adapter {adapter.name!r} is skipped: {error!r}. [adapter.matches]")
     from usdbrdf.capture.unrecognised import what_lies_there
 
     with environment_failures(str(path)):
@@ -196,7 +196,7 @@ def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, 
     if not path.is_dir():
         return
     for pattern in ("*/", "*/*/"):
-        for folder in sorted(path.glob(pattern))[:_MOST_BELOW]:
+        for folder in seen_of(path.glob(pattern))[:_MOST_BELOW]:
             for adapter in sound:
                 if adapter.module and adapter.name in MODULES and adapter.module.matches(folder):
                     yield folder.relative_to(path), adapter
@@ -235,9 +235,7 @@ def _loaded(point: EntryPoint) -> Adapter:
             ]
             problem = f"it has no {', '.join(missing)}" if missing else ""
     if problem:
-        say(
-            f"warning: adapter {point.name!r} ({point.value}) is skipped: {problem}. [adapter.load]"
-        )
+        warn(f"adapter {point.name!r} ({point.value}) is skipped: {problem}. [adapter.load]")
         module = None
     package = f"{point.dist.metadata['Name']} {point.dist.version}" if point.dist else ""
     return Adapter(

@@ -26,7 +26,7 @@ from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.exif import exif_exposure, told_by_some
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, transparent_of
 from usdbrdf.files.images import colour_tag, is_eight_bit, needs_float, read_radiance, write_exr
-from usdbrdf.files.paths import contained
+from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Double
 
@@ -272,7 +272,7 @@ def _linear_space(source: Path, document: Any, photograph: Path) -> str:
 def _document_of_folder(folder: Path) -> dict[str, Any]:
     """What a transforms.json would say of a folder of photographs, all of one view."""
     with environment_failures(str(folder)):
-        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _PHOTOGRAPHS)
+        paths = sorted(p for p in seen_of(folder.iterdir()) if p.suffix.lower() in _PHOTOGRAPHS)
     if len(paths) < 2:
         raise InputRefused(
             f"{folder}: neither a transforms.json nor two photographs (JPEG, PNG) of one view. "

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 from usdbrdf.cluster.options import is_url
 from usdbrdf.cluster.store import DIGITS, Files, Folder, Wanted
-from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
+from usdbrdf.errors import EnvironmentFailure, UsageError, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of, temporary_beside, write_text_atomic
 from usdbrdf.job.progress import say
 
@@ -124,7 +124,7 @@ class Objects(Files):
     def drop(self, name: str) -> None:
         """What cannot be deleted now goes with all the others."""
         (self.folder / name).unlink(missing_ok=True)
-        with suppress(EnvironmentFailure):
+        with suppress(UsdBrdfError):
             self._asked(lambda: self._system.rm_file(self._at(name)))
 
     def path_told(self, path: Path) -> dict[str, Any]:
@@ -180,7 +180,7 @@ class Objects(Files):
             self._asked(lambda: self._system.rm(self._prefix, recursive=True))
         except _Missing:
             pass
-        except EnvironmentFailure as failure:
+        except UsdBrdfError as failure:
             say(f"{failure} What this task uploaded is still there.")
 
     def _at(self, name: str) -> str:
@@ -192,7 +192,7 @@ class Objects(Files):
         except Exception as error:  # of every library its own
             raise self._failed(error) from error
 
-    def _failed(self, error: Exception) -> EnvironmentFailure:
+    def _failed(self, error: Exception) -> UsdBrdfError:
         """What a store's refusal means; those that pass were tried again by its library."""
         kind, said = type(error).__name__, " ".join(str(error).split())
         if isinstance(error, FileNotFoundError):
@@ -213,9 +213,9 @@ class Objects(Files):
                 "run the same command again; finished work is kept. [cluster.objects]"
             )
         if "Validation" in kind:  # of the name alone, before anybody is asked
-            return EnvironmentFailure(
-                f"{self.address}: is no place in an object store ({said}). Correct "
-                "--shared-folder. [cluster.objects]"
+            return UsageError(
+                f"--shared-folder {self.address}: is no place in an object store ({said[:200]}). "
+                "Correct it. [cluster.objects]"
             )
         return _Passing(
             f"{self.address}: the object store failed ({kind}: {said}). See whether this machine "
@@ -232,8 +232,8 @@ class _Passing(EnvironmentFailure):
 
 
 def files_at(address: str | Path, copies: Path) -> Files:
-    """Those of a folder or an object store; ``copies`` is where those of the latter go. Raises
-    EnvironmentFailure for a store that nothing here can talk to."""
+    """Those of a folder or an object store; ``copies`` is where those of the latter go. Raises as
+    ``refuse_unknown`` for a store that nothing here can talk to."""
     if is_url(address):
         return Objects(str(address), copies)
     return Folder(Path(address).absolute())
@@ -279,15 +279,14 @@ def _noted(folder: Path) -> str | None:
     return None
 
 
-def _file_system(address: str) -> tuple[Any, str]:
-    """What fsspec has for an address, and the address as that knows it."""
+def refuse_unknown(address: str) -> None:
+    """UsageError for a store that nothing knows, EnvironmentFailure where what does is not
+    installed; nobody is asked for it yet."""
+    from fsspec import get_filesystem_class
+
     kind = address.partition("://")[0]
     try:
-        from fsspec.core import url_to_fs
-
-        # Folders are made where there are such.
-        more = {"auto_mkdir": True} if kind in ("file", "local") else {}
-        system, prefix = url_to_fs(address, use_listings_cache=False, **more)
+        get_filesystem_class(kind)
     except ImportError as error:
         raise EnvironmentFailure(
             f"--shared-folder {address}: what talks to {kind}:// is not installed ({error}). Run: "
@@ -295,10 +294,22 @@ def _file_system(address: str) -> tuple[Any, str]:
             "[environment.fsspec]"
         ) from error
     except ValueError as error:
-        raise EnvironmentFailure(
+        raise UsageError(
             f"--shared-folder {address}: {error}. Give a folder, or a URL that fsspec knows, such "
             "as s3://BUCKET/PREFIX. [cluster.objects]"
         ) from error
+
+
+def _file_system(address: str) -> tuple[Any, str]:
+    """What fsspec has for an address, and the address as that knows it."""
+    kind = address.partition("://")[0]
+    refuse_unknown(address)
+    try:
+        from fsspec.core import url_to_fs
+
+        # Folders are made where there are such.
+        more = {"auto_mkdir": True} if kind in ("file", "local") else {}
+        system, prefix = url_to_fs(address, use_listings_cache=False, **more)
     except Exception as error:  # of those that ask their store at once, of every library its own
         raise EnvironmentFailure(
             f"--shared-folder {address}: the object store does not answer "

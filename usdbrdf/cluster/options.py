@@ -11,9 +11,11 @@ from usdbrdf.option import Options, is_one_line, option
 # Hosts, without a scheme or with any that Dask has learnt, and a port where there is one.
 _ADDRESS = re.compile(r"(?!\w*://(?:[/:]|\Z))[^\s/:]\S*", re.ASCII)
 _PORT = re.compile(r":(\d+)\Z", re.ASCII)
-# What the libraries of object stores read as a pattern, as a version, or as the end of one URL and
-# the begin of another; a host may be a number in brackets.
+# What the libraries of object stores read as a pattern, a version, or the end of one URL and the
+# begin of another; a host may be in brackets.
 _PATTERN = re.compile(r"[^/]*//[^/]*/.*([*?[]|::)", re.DOTALL)
+# What may be called a bucket of S3, or an access point to one.
+_OF_S3 = re.compile(r"s3a?://(?:[\w.-]{1,255}|arn:[^\s/]+)(?:/.*)?", re.DOTALL | re.ASCII)
 # What a URL has between its scheme and a prefix; of files that is the prefix.
 _STORE = re.compile(r"(?:(?:file|local):///|[a-z][a-z0-9+.-]*://[^/\s]).*", re.DOTALL | re.ASCII)
 
@@ -50,22 +52,8 @@ class ClusterOptions(Options):
                 f"--scheduler {self.scheduler!r}: is no address of a scheduler. Give one such as "
                 "tls://HOST:8786. [usage.option]"
             )
-        if is_url(self.shared_folder) and not _STORE.fullmatch(str(self.shared_folder)):
-            raise UsageError(
-                f"--shared-folder {self.shared_folder}: names no bucket. Give a folder, or a store "
-                "such as s3://BUCKET/PREFIX. [usage.option]"
-            )
-        if is_url(self.shared_folder) and _PATTERN.match(str(self.shared_folder)):
-            raise UsageError(
-                f"--shared-folder {self.shared_folder}: has one of *, ?, [ or :: in it, which "
-                "stand for more than themselves in object stores. Give another prefix. "
-                "[usage.option]"
-            )
-        if is_url(self.shared_folder) and "memory://" in str(self.shared_folder):
-            raise UsageError(
-                f"--shared-folder {self.shared_folder}: no other process sees this one's memory. "
-                "Give a folder, or a store such as s3://BUCKET/PREFIX. [usage.option]"
-            )
+        if is_url(self.shared_folder) and (why := _why_no_store(str(self.shared_folder))):
+            raise UsageError(f"--shared-folder {self.shared_folder}: {why}. [usage.option]")
 
     @property
     def asked(self) -> bool:
@@ -77,3 +65,19 @@ def _is_address(text: str) -> bool:
     port = _PORT.search(text)
     named = _ADDRESS.fullmatch(text) is not None and is_one_line(text)
     return named and (port is None or 0 < int(port[1]) < 1 << 16)
+
+
+def _why_no_store(url: str) -> str:
+    """Why nobody could share it, and what to give; "" where somebody may."""
+    if "::" in url.partition("://")[0]:
+        return f"is a chain of stores. Give that at its end alone, {url.rpartition('::')[2]}"
+    such = "Give a folder, or a store such as s3://BUCKET/PREFIX"
+    if not _STORE.fullmatch(url):
+        return f"names no bucket or host. {such}"
+    if url.startswith(("s3:", "s3a:")) and not _OF_S3.fullmatch(url):
+        return f"no bucket can be called so. {such}"
+    if _PATTERN.match(url):
+        return f"has *, ?, [ or :: in it, which stores read as more than that. {such}"
+    if url.startswith("memory:"):
+        return f"no other process sees this one's memory. {such}"
+    return ""

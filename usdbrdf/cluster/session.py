@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import os
 import signal
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from usdbrdf.cluster.options import ClusterOptions, is_url
-from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.errors import EnvironmentFailure, UsageError
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.progress import say
 from usdbrdf.job.units import HERE, Unit, Workers
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
 _ANSWER = 20.0
 # What Dask raises where it takes longer.
 _LATE = (TimeoutError, asyncio.TimeoutError)
+# Of what is no name of a folder, whoever asks.
+_NO_FOLDERS = (
+    errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL,
+)  # fmt: skip
 # Dask looks at every thread's stack a hundred times a second, which takes time from the work.
 _UNWATCHED = {
     "distributed.worker.profile.enabled": False,
@@ -47,14 +52,35 @@ _DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 def workers_of(options: ClusterOptions | None = None, client: Any = None) -> Iterator[Workers]:
     """Who does units of work in here: this process, or the workers that the options name, or those
     of ``client``, a ``distributed.Client`` that stays the caller's. Workers of our own start when
-    they are first needed. Raises EnvironmentFailure where Dask is not installed."""
+    they are first needed. Raises EnvironmentFailure where Dask is not installed, and UsageError
+    for what cannot be shared."""
     chosen = options or ClusterOptions()
     if client is None and not chosen.asked:
         yield HERE
         return
     _need_dask()
+    _check_place(chosen.shared_folder)
     with ExitStack() as stack:
         yield _Session(chosen, client, stack)
+
+
+def _check_place(place: Path | str | None) -> None:
+    """Raise, before any work, what makes a folder or a store none that workers can share."""
+    if isinstance(place, str) and is_url(place):
+        from usdbrdf.cluster.object_store import refuse_unknown
+
+        refuse_unknown(place)
+    elif place is not None:
+        try:
+            Path(place).mkdir(parents=True, exist_ok=True)
+            if not os.access(place, os.W_OK | os.X_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        except OSError as error:
+            kind = UsageError if error.errno in _NO_FOLDERS else EnvironmentFailure
+            raise kind(
+                f"--shared-folder {place}: nothing can be written there ({error.strerror}). Give a "
+                "folder that all workers see, under the same name, or a store. [cluster.folder]"
+            ) from error
 
 
 class _Session:

@@ -31,12 +31,13 @@ from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import write_preview_png
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
-from usdbrdf.job.progress import progress
+from usdbrdf.job.progress import progress, warn
 from usdbrdf.model.arrays import Bool, Float
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import EvaluateOptions, Surroundings
 from usdbrdf.transport.brdf import DIELECTRIC, PAPER
+from usdbrdf.transport.environment import unknown_primaries
 from usdbrdf.transport.let_through import share_let_through
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
@@ -275,6 +276,8 @@ def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Surroundings) -> V
         )
     kind = DIELECTRIC if any(fit.lobe != "paper" for fit in fits) else PAPER
     beckmann = np.array([fit.lobe == BECKMANN_FACETS for fit in fits], np.bool_)
+    if isinstance(environment, Path) and (unknown := unknown_primaries(environment)):
+        warn(unknown)
     surfaces = atlas.lit_scene(atlas.environment(environment))
     lit = replace(surfaces, lobe=kind, beckmann=beckmann)
     diffuse = atlas.map_where_present(_map_or(atlas, "diffuse", "lit"), 3)

@@ -7,6 +7,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.manifest import read_manifest
+from usdbrdf.errors import InputRefused
 from usdbrdf.farm.records import Record, Results, read_record
 from usdbrdf.farm.scans import ScanList
 from usdbrdf.job.stamp import missing_of
@@ -62,12 +65,25 @@ def _row(name: str, place: str, results: Results) -> Row:
     )
 
 
-def _while_it_is_there(record: Record, asset: Path) -> Record:
+def _while_it_is_there(record: Record, folder: Path) -> Record:
     """The record of a scan that was converted, or that of one that is to be again: its asset may
-    have been deleted since, or a part of it."""
-    if (missing := missing_of(asset)) is None:
+    have been deleted since, or a part of it. A published version may have taken its place; and it
+    is whole without what tells of photographs."""
+    asset = Asset.at(folder)
+    if asset.is_published:
+        try:
+            files = read_manifest(folder).files
+        except InputRefused as refused:
+            return Record(status="unfinished", sentence=str(refused))
+        missing = next((name for name in files if not (folder / name).is_file()), None)
+        cure = ". Bring it back from a copy"
+    else:
+        photographs = asset.photographs_layer.relative_to(asset.folder).as_posix()
+        missing = missing_of(folder, spared=photographs)
+        cure = "; the next run of the job makes it again"
+    if missing is None:
         return record
-    sentence = f"{asset / missing}: is gone; the next run of the job makes it again. [farm.asset]"
+    sentence = f"{folder / missing}: is gone{cure}. [farm.asset]"
     return Record(status="unfinished", sentence=sentence)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -131,3 +132,9 @@ def files_below(folder: Path, *, without: Path) -> list[Path]:
         and path.is_file()
         and not (whole / path.relative_to(folder)).is_relative_to(own)
     )
+
+
+def seen_of(found: Iterable[Path]) -> list[Path]:
+    """Sorted, without what systems leave beside what people put there: .DS_Store, of each file a
+    ._NAME that ends as that does, and whatever else is hidden."""
+    return sorted(p for p in found if p.name[0] != "." and not any(map(p.match, _LITTER)))

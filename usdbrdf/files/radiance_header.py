@@ -25,6 +25,12 @@ def factors_of_hdr(path: Path) -> Double:
     ImageRefused where it states a GAMMA: what was raised to a power is no radiance."""
     factors = np.ones(3)
     for key, numbers in _stated(path):
+        if key == b"GAMMA" and len(numbers) == 1 and not 0 < numbers[0] < np.inf:
+            raise ImageRefused(
+                f"{path}: its header states GAMMA={numbers[0]:g}, which nothing can be corrected "
+                "by, so whether its pixels are radiance is not known. Save it linear, or take the "
+                "line out if it is. [image.gamma]"
+            )
         if key == b"GAMMA" and len(numbers) == 1 and abs(numbers[0] - 1) > _LINEAR:
             raise ImageRefused(
                 f"{path}: its header states GAMMA={numbers[0]:g}, so its pixels are gamma "
@@ -44,7 +50,7 @@ def primaries_of_hdr(path: Path) -> tuple[float, ...]:
 
 
 def _stated(path: Path) -> list[tuple[bytes, Double]]:
-    """Lines of finite numbers, in their order."""
+    """Lines of finite numbers, and of a GAMMA whatever it is, in their order."""
     # Every frame is asked, each time that it is read, and few are Radiance's.
     if beginning_of(path, len(_MARK)) != _MARK:
         return []
@@ -56,6 +62,6 @@ def _stated(path: Path) -> list[tuple[bytes, Double]]:
             numbers = np.array(said.split(), np.float64)
         except ValueError:
             continue
-        if np.isfinite(numbers).all():
+        if np.isfinite(numbers).all() or key == b"GAMMA":
             found.append((key, numbers))
     return found

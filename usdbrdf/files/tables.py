@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.atomic import raise_shortage
 from usdbrdf.files.documents import (
     DAMAGED_ARRAYS,
     MAX_BYTES,
@@ -21,7 +22,7 @@ from usdbrdf.files.documents import (
     read_text,
     refusal_of_arrays,
 )
-from usdbrdf.files.paths import why_not_fetched
+from usdbrdf.files.paths import seen_of, why_not_fetched
 from usdbrdf.model.arrays import Array, Double
 
 Element = ElementTree.Element
@@ -30,7 +31,7 @@ Element = ElementTree.Element
 def files_of(path: Path, suffixes: Collection[str]) -> list[Path]:
     """The files in a folder, or the one that ``path`` is, that end in one of these suffixes, which
     are small letters, in letters of any case."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    files = seen_of(path.iterdir()) if path.is_dir() else [path]
     return [file for file in files if file.suffix.lower() in suffixes and file.is_file()]
 
 
@@ -41,7 +42,8 @@ def beginning_of(path: Path, num_bytes: int = 2000) -> bytes:
             return b""
         with path.open("rb") as file:
             return file.read(num_bytes)
-    except OSError:
+    except OSError as error:
+        raise_shortage(error)
         return b""
 
 

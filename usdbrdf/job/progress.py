@@ -51,14 +51,14 @@ def tell_lines_to(hearer: Callable[[str], None] | None) -> None:
 
 
 def say(line: str) -> None:
-    """One plain line to stderr unless quiet, above a running bar; control characters are shown, not
-    obeyed."""
+    """One plain line to stderr unless quiet, above a running bar; newlines and control characters
+    are shown, not obeyed."""
     if not _quiet:
-        tell(line)
+        tell(in_one_line(line))
 
 
 def tell(line: str) -> None:
-    """The same for what must be said, quiet or not."""
+    """The same for what must be said, quiet or not, in as many lines as it has."""
     if sys.stderr is None:
         return
     # No bar is running where it was never loaded.
@@ -103,7 +103,7 @@ def _give_up(stream: TextIO) -> None:
 
 def warn(sentence: str) -> None:
     """Say what was left out or may be wrong, and go on."""
-    say(f"warning: {in_one_line(sentence)}")
+    say(f"warning: {sentence}")
 
 
 def progress(iterable: Iterable[T], *, total: int, label: str, unit: str) -> Iterator[T]:

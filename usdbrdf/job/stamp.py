@@ -167,14 +167,14 @@ def why_rerun(asset: Path, order: int, wanted: Stamp) -> str | None:
     return f"output missing: {missing[0]}" if missing else None
 
 
-def missing_of(asset: Path) -> str | None:
-    """The first file that stamps tell of and that is not there, or the folder of stamps where that
-    has none; what is in the files is not looked at."""
+def missing_of(asset: Path, *, spared: str = "") -> str | None:
+    """The first file that stamps tell of and that is not there, but for the one that is ``spared``,
+    or the folder of stamps where that has none; what is in the files is not looked at."""
     stamps = [*filter(None, map(read_stamp, sorted((asset / STATE_FOLDER).glob("stamps/*.json"))))]
     if not stamps:
         return f"{STATE_FOLDER}/stamps"
     names = (name for stamp in stamps for name in (*stamp.outputs, *stamp.once))
-    return next((name for name in names if not (asset / name).is_file()), None)
+    return next((n for n in names if n != spared and not (asset / n).is_file()), None)
 
 
 def known_hashes(state_folder: Path) -> dict[str, set[str]]:

@@ -39,6 +39,8 @@ _AROUND = 2
 _UNEVEN, _OF_OTHER_LIGHT = calibration.pair("unseen.uneven")
 # Among the sources of one scan, beside the sky's patches and the sun, which are 0.
 _LAMP = 1
+# In the dark some of the little light that arrives is not known.
+_STRAY = calibration.number("lamps.stray")
 _LEAST_EVEN = calibration.number("unseen.least_even")
 _BRIGHTER = calibration.number("unseen.brighter")
 LEAST_PART = calibration.number("unseen.least_part")
@@ -114,6 +116,7 @@ def sources_of(lamps: Lamps, share: Double) -> Sources:
         family=np.full(len(share), _LAMP, np.int64),
         pairs=np.zeros((0, 2), np.int64),
         apart=np.zeros(0),
+        stray=_STRAY,
     )
 
 
@@ -142,6 +145,18 @@ def shining(radiance: Double, near: Double, part: Double) -> Bool:
     """Which (K,) are clearly brighter than what only reflects, even with as much light as the
     texels that see it receive; near and part (K,) as of ``Strengths``."""
     return np.asarray((np.pi * radiance.mean(axis=1) > _BRIGHTER * near) & (part > LEAST_PART))
+
+
+def known_well(error: Double, part: Double, most: float) -> Bool:
+    """Which sources (K,) are known so well that light is with them closer to what it is than
+    without, by a factor ``most``.
+
+    The logarithm of S of which a source brings a ``part`` (K,) is off by part times the relative
+    ``error`` (K,) of its strength, and by -log(1 - part) if it is left out: what brings little must
+    be known well, and what brings most of the light need not.
+    """
+    part = np.clip(part, 1e-6, 1 - 1e-6)
+    return np.asarray(part * error < -most * np.log1p(-part), np.bool_)
 
 
 def brought(

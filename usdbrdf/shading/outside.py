@@ -38,6 +38,7 @@ from usdbrdf.shading.lamp_light import (
     Lamps,
     beside_others,
     brought,
+    known_well,
     shining,
     sources_of,
     without,
@@ -364,11 +365,12 @@ def _beside_mirrored(look: _Look, told: _Told) -> _Told:
 
 def _sun_shines(told: _Told, error: Double) -> bool:
     """error (K, 3): of the sources with the sun."""
-    strength = float(np.exp(told.found.log_radiance[-1]).mean())
-    strength /= float(np.median(told.light().mean(axis=1)))
+    strength = np.exp(told.found.log_radiance[-1]).mean() / np.median(told.light().mean(axis=1))
     # What no texel sees keeps what was thought of it before, and errs by nothing.
     sees = np.count_nonzero(told.with_sun[1].share[-1]) >= LEAST_OF_SEGMENT
-    return bool(sees and error[-1].max() < _MOST_SUN_ERROR and strength > _LEAST_SUN)
+    _, part = beside_others(*told.with_sun, told.found)
+    known = known_well(error[-1:].max(axis=1), part[-1:], _MOST_SUN_ERROR)
+    return bool(sees and known[0] and strength > _LEAST_SUN)
 
 
 def _sunless(look: _Look, told: _Told) -> tuple[_Told, Double]:

@@ -52,7 +52,7 @@ class Sources(NamedTuple):
     (K,), those of one are as far from that together as one of them may be, -1 for one that errs by
     itself; and pairs of neighbours, which are alike, (P, 2), by how much these are apart, (P,); and
     the gloss of segments, the share that they mirror of what usual dielectrics would: mean and
-    standard deviation."""
+    standard deviation; stray, the share of the mean S that may reach any texel unknown."""
 
     share: Double
     mean: Double
@@ -61,6 +61,7 @@ class Sources(NamedTuple):
     pairs: Long
     apart: Double
     gloss: tuple[float, float] = (0.0, 0.0)
+    stray: float = 0.0
 
     def irradiance(self, log_radiance: Double) -> Double:
         """(N, 3) W/m^2 of all of them."""
@@ -157,6 +158,7 @@ def _solved_channel(
         # What clips reflects at least as much: it says something where the model says less.
         counts = counted & (~asked.clipped | (residual > 0))
         noise = _noise_of_segments(asked, residual, num_segments)[asked.segment]
+        noise = np.hypot(noise, sources.stray * total.mean() / total)
         weight = (_FREEDOM + 1) / (_FREEDOM + (residual / noise) ** 2) / noise**2
         weight = weight * effective * counts
         np.divide(share, total[:, None], out=by_source)

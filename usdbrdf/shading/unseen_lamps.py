@@ -28,6 +28,7 @@ from usdbrdf.shading.lamp_light import (
     ROUGHLY,
     beside_lamps,
     brought,
+    known_well,
     looked_at_closely,
     shining,
     sources_of,
@@ -136,7 +137,7 @@ def lamps_that_explain(
         lamp = shining(found, near, part)[own] | certain
         if lamp.all():  # none of the others blurs what these are any more
             brightness = np.log(np.pi * found.mean(axis=1) / near)[own]
-            lamp = (brightness > 2 * error[own]) & (error[own] < _MOST_ERROR)
+            lamp = (brightness > 2 * error[own]) & known_well(error[own], part[own], _MOST_ERROR)
             lamp |= certain & (error[own] < MOST_OF_CERTAIN)
         if lamp.all():
             order = np.argsort(likely.object)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ from usdbrdf.untrusted.usd_files import check_units, render_scene_of_usd
 # Attributes that name the picture behind a camera: USD's own back plates, and Houdini's.
 _PLATES = ("houdini:backgroundimage", "usdBrdf:capture:image")
 _MOST_BETWEEN = 10_000  # times of one camera
+# Of a sequence, where its pictures' numbers stand in their names: plate.####.exr, plate.%04d.exr.
+_NUMBER = re.compile(r"#+|%0?(\d?)d")
 _SHAPE = "verticalAperture"
 _LENS = (
     "focalLength",
@@ -41,7 +44,7 @@ class UsdCamera:
     lens               (T, 5) focal length, horizontal and vertical aperture (NaN where it is
                        left at its default), and their offsets, in one unit
     exposure           (T,) what the exposure attributes multiply radiance by
-    images             T absolute paths, or patterns of such with # or %d for the number; "" where
+    images             T absolute paths, existing or not, of sequences those of the times; "" where
                        the camera names none
     """
 
@@ -96,10 +99,9 @@ def read_here(path: Path) -> tuple[UsdCameras]:
 def _camera(camera: UsdGeom.Camera) -> UsdCamera:
     prim = camera.GetPrim()
     named = map(prim.GetAttribute, _names_of_plates(prim))
-    first = Usd.TimeCode.EarliestTime()
-    plate = next((a for a in named if _is_path(a.Get(first))), None)
-    sampled = _sample_times(camera, plate)
-    times = sorted({*sampled, *_times_between(camera, sampled)})
+    plate = next((a for a in named if any(map(_is_path, _values(a)))), None)
+    sampled, between = _times_of(camera, plate)
+    times = sorted({*sampled, *between})
     codes = [Usd.TimeCode(time) for time in times] or [Usd.TimeCode.EarliestTime()]
     said = [name for name in _LENS if name != _SHAPE or prim.GetAttribute(name).IsAuthored()]
     lens = [
@@ -117,7 +119,7 @@ def _camera(camera: UsdGeom.Camera) -> UsdCamera:
         ),
         lens=np.array(lens, np.float64),
         exposure=np.array([camera.ComputeLinearExposureScale(code) for code in codes]),
-        images=tuple(_file_of(plate, code) if plate else "" for code in codes),
+        images=_images(plate, codes) if plate else ("",) * len(codes),
     )
 
 
@@ -127,17 +129,26 @@ def _names_of_plates(prim: Usd.Prim) -> list[str]:
     return [name for name in plates if name.endswith(":image")] + [n for n in _PLATES if n in own]
 
 
-def _sample_times(camera: UsdGeom.Camera, plate: Any) -> list[float]:
-    """When the camera names another picture; else when it, or what it hangs on, moves or zooms."""
+def _values(plate: Usd.Attribute) -> list[object]:
+    """What an attribute names at any time."""
+    codes = map(Usd.TimeCode, plate.GetTimeSamples())
+    return [plate.Get(code) for code in [*codes, Usd.TimeCode.EarliestTime()]]
+
+
+def _times_of(camera: UsdGeom.Camera, plate: Any) -> tuple[list[float], Sequence[float]]:
+    """When the camera names another picture, and nothing between, where one name lasts until the
+    next; else when it, or what it hangs on, moves or zooms, and whole times between."""
+    named = set(plate.GetTimeSamples()) if plate and plate.GetNumTimeSamples() > 1 else set()
+    if named and not any(_is_sequence(_file_of(plate, Usd.TimeCode(t))) for t in named):
+        return sorted(named), ()
     prim = camera.GetPrim()
-    if plate and plate.GetNumTimeSamples() > 1:
-        return list(plate.GetTimeSamples())
-    times = {time for name in _LENS for time in prim.GetAttribute(name).GetTimeSamples()}
+    times = named.union(*(prim.GetAttribute(name).GetTimeSamples() for name in _LENS))
     while prim and not prim.IsPseudoRoot():
         moving = UsdGeom.Xformable(prim)
         times |= set(moving.GetTimeSamples() if moving else ())
         prim = prim.GetParent()
-    return sorted(times) if len(times) > 1 else []
+    sampled = sorted(times) if len(times) > 1 else []
+    return sampled, _times_between(camera, sampled)
 
 
 def _times_between(camera: UsdGeom.Camera, sampled: Sequence[float]) -> Sequence[float]:
@@ -153,6 +164,40 @@ def _times_between(camera: UsdGeom.Camera, sampled: Sequence[float]) -> Sequence
                 return ()
         prim = prim.GetParent()
     return range(math.ceil(sampled[0]), math.floor(sampled[-1]) + 1)
+
+
+def _images(plate: Usd.Attribute, codes: Sequence[Usd.TimeCode]) -> tuple[str, ...]:
+    """The picture of each time."""
+    if codes[0].IsEarliestTime():
+        return (_file_of(plate, codes[0]),)
+    times = [code.GetValue() for code in codes]
+    files = [_file_of(plate, code) for code in codes]
+    if len(times) > 1 and len(set(files)) == 1:
+        # One name for many times may be that of one picture of a sequence, by its number.
+        folder, name = os.path.split(files[0])
+        number = re.search(r"\d+(?=\.[^.]*$)", name)
+        if number and int(number[0]) in times:
+            before, after = name[: number.start()], name[number.end() :]
+            numbers = ["" if t % 1 else f"{int(t)}".zfill(len(number[0])) for t in times]
+            return tuple(n and os.path.join(folder, before + n + after) for n in numbers)
+    return tuple(map(_at_time, files, times))
+
+
+def _is_sequence(file: str) -> bool:
+    """Whether a file's name stands for many; one that is there is no more than that."""
+    return bool(_NUMBER.search(os.path.basename(file))) and not os.path.isfile(file)
+
+
+def _at_time(file: str, time: float) -> str:
+    """The file, of a sequence the one of this number; "" at times between its pictures."""
+    if not _is_sequence(file):
+        return file
+    folder, name = os.path.split(file)
+
+    def numbered(found: re.Match[str]) -> str:
+        return f"{int(time)}".zfill(int(found[1] or 1) if found[0][0] == "%" else len(found[0]))
+
+    return os.path.join(folder, _NUMBER.sub(numbered, name)) if time % 1 == 0 else ""
 
 
 def _file_of(plate: Usd.Attribute, code: Usd.TimeCode) -> str:

@@ -25,7 +25,7 @@ from usdbrdf.asset.readers.tried import (
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, sha256_of
 from usdbrdf.job.child import run_child
-from usdbrdf.job.progress import say
+from usdbrdf.job.progress import warn
 from usdbrdf.job.stamp import STATE_FOLDER, hash_of_files, read_stamp
 from usdbrdf.model.arrays import Array
 from usdbrdf.options import NO_LIGHT, Surroundings
@@ -129,7 +129,7 @@ def warn_of_edits(asset: Asset) -> None:
     try:
         try_in_child(asset.root_layer)
     except UsdBrdfError as problem:
-        say(f"warning: {problem} The layers in layers/ are measured all the same.")
+        warn(f"{problem} The layers in layers/ are measured all the same.")
 
 
 def try_in_child(layer: Path, *, composes: bool = True, beside: Sequence[Path] = ()) -> None:

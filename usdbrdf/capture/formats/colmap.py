@@ -42,6 +42,7 @@ from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.images import image_size
+from usdbrdf.files.paths import seen_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
@@ -189,7 +190,7 @@ def _workspaces(path: Path) -> list[_Workspace]:
             beside.remove("input")  # what its images were made of
         found += [_Workspace(f, tuple(beside)) for f in folders if model_files(f)]
     # Of any name, if nothing but the model lies there: others may be captures of their own.
-    others = (f for pattern in _MODELS_BELOW for f in sorted(path.glob(pattern)) if not found)
+    others = (f for pattern in _MODELS_BELOW for f in seen_of(path.glob(pattern)) if not found)
     return found or [_Workspace(f, _IMAGES) for f in others if _holds_a_model_alone(f)]
 
 
@@ -197,7 +198,8 @@ def _holds_a_model_alone(folder: Path) -> bool:
     """Whether there are neither folders nor pictures or meshes beside a model."""
     if folder.name.startswith(".") or not model_files(folder):
         return False
-    return all(f.is_file() and f.suffix.lower() in _BESIDE_MODELS for f in folder.iterdir())
+    beside = seen_of(folder.iterdir())
+    return all(f.is_file() and f.suffix.lower() in _BESIDE_MODELS for f in beside)
 
 
 def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
@@ -266,7 +268,7 @@ def _of_full_size(counts: dict[str, int]) -> dict[str, int]:
 def _elsewhere(path: Path, workspaces: Sequence[_Workspace], findings: Findings) -> list[_Chosen]:
     """The first model with images, by their very names, in one folder of the capture that is none
     of normals, depths or masks; InputRefused where several hold as many."""
-    below = (p for level in _BELOW for p in sorted(path.glob(level)) if not p.is_symlink())
+    below = (p for level in _BELOW for p in seen_of(path.glob(level)) if not p.is_symlink())
     folders = [p.relative_to(path).as_posix() for p in below]
     folders = [folder for folder in folders if not _LAYERS.search(folder)]
     for workspace in workspaces:

@@ -27,7 +27,7 @@ from usdbrdf.capture.parts import (
 from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
-from usdbrdf.files.paths import contained
+from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -243,7 +243,7 @@ def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
 def _below(folder: Path, *, deep: bool) -> Pictures:
     """Pictures in a folder; links that lead out of it do not count."""
     found = folder.rglob("*") if deep else folder.glob("*")
-    inside = (p for p in found if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    inside = (p for p in seen_of(found) if p.suffix.lower() in SUFFIXES)
     home = folder.resolve()
     paths = (p for p in inside if p.is_file() and p.resolve().is_relative_to(home))
     return Pictures(folder=folder, paths=tuple(sorted(paths)))
@@ -372,14 +372,14 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
     if options.mesh is not None:
         return options.mesh
     for pattern in usual:
-        found = [p for p in sorted(folder.glob(pattern)) if p.suffix.lower() in _MESHES]
+        found = [p for p in seen_of(folder.glob(pattern)) if p.suffix.lower() in _MESHES]
         if found:
             return contained(folder, found[0].relative_to(folder).as_posix())
-    there = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in _MESHES]
+    there = [p for p in seen_of(folder.iterdir()) if p.suffix.lower() in _MESHES]
     others = [p for p in there if not holds_points_alone(beginning_of(p, LONGEST_HEADER))]
     if len(others) == 1:
         return contained(folder, others[0].name)
-    unread = [p.name for p in sorted(folder.iterdir()) if p.suffix.lower() in _UNREAD_MESHES]
+    unread = [p.name for p in seen_of(folder.iterdir()) if p.suffix.lower() in _UNREAD_MESHES]
     said = f"{len(others)} meshes" if others else "no mesh"
     if unread and not others:
         said += f" that is read ({unread[0]} is none of {', '.join(_MESHES)})"
@@ -426,7 +426,7 @@ def scan_of(
             f"{source.name}: {masks} masks are used; what is black there is not looked at. "
             "[capture.mask]"
         )
-    elif (folder / "masks").is_dir() and any((folder / "masks").iterdir()):
+    elif (folder / "masks").is_dir() and any(seen_of((folder / "masks").iterdir())):
         findings.warn(
             f"{source.name}: nothing is masked: there is a folder masks, but none of its pictures "
             "is called as one of the frames, or named by it. [capture.mask]"

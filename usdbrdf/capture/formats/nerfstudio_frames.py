@@ -40,6 +40,10 @@ FILE = "dataparser_transforms.json"
 EXPORTED = ("poisson_mesh.ply", "tsdf_mesh.ply", "sdf_marching_cubes_mesh.ply")
 # Folders of a scene of ScanNet++, which hold nerfstudio/.
 _OF_SCANNETPP = ("dslr", "iphone")
+# ScanNet++'s keys for the frames it tests with, and of one that is blurred.
+TESTED, BAD = "test_frames", "is_bad"
+# Folder of the reconstruction that old documents were made of.
+_COLMAP = "colmap/sparse/0"
 # What COLMAP calls its meshes, and where its models lie that documents were made of, instant-ngp's
 # first.
 _COLMAPS = ("meshed-poisson.ply", "meshed-delaunay.ply")
@@ -84,6 +88,21 @@ def scene_above(document: Path) -> Path | None:
     scene = document.parents[min(2, len(document.parents) - 1)]
     apart = document.parent.name == "nerfstudio" and document.parent.parent.name in _OF_SCANNETPP
     return scene if apart and (scene / "scans").is_dir() else None
+
+
+def is_bad(frame: Mapping[str, Any]) -> bool:
+    """Whether ScanNet++ says of a frame that it is blurred."""
+    return frame.get(BAD) is True
+
+
+def warn_of_bad(left: int, total: int, document: str, findings: Findings) -> None:
+    """One sentence on the frames of a document that are left out as it says that they are bad."""
+    if left:
+        findings.count("frames_said_to_be_bad", left)
+        findings.warn(
+            f"{document}: {left} of {total} frames are left out, of which it says {BAD}. "
+            "[capture.image]"
+        )
 
 
 def stated_pose(matrix: object) -> Double | None:
@@ -338,7 +357,43 @@ def _capture_from_colmap(
     return models[0], rigid_pose(scale * turn, centre - scale * from_centre)
 
 
-def old_axes_by_model(model: Path, frames: Sequence[Mapping[str, Any]]) -> bool | None:
+def has_old_axes(
+    source: Path,
+    document: Mapping[str, Any],
+    frames: Sequence[Mapping[str, Any]],
+    findings: Findings,
+    *,
+    in_scene: bool,
+) -> bool:
+    """Whether the poses are in the axes that nerfstudio gave COLMAP's before 2023, and ScanNet++
+    those of its scenes, which is told where the document does not say so."""
+    beside = (source.parent / _COLMAP).is_dir()
+    sign = TESTED if TESTED in document else BAD if any(BAD in row for row in frames) else ""
+    if "applied_transform" in document or not (beside or sign or in_scene):
+        return False
+    known = _old_axes_by_model(source.parent / _COLMAP, frames) if beside else in_scene or None
+    if known is False:
+        return False
+    if beside:
+        how = "are" if known else "are taken for"
+        said = (
+            f"{_COLMAP} lies beside it and it states no applied_transform, so its poses {how} "
+            "those of nerfstudio before 2023, whose axes are undone"
+        )
+        doubt = "if they are not"
+    else:
+        known_by = "belongs to a scene" if in_scene else f"has {sign}, as documents"
+        said = (
+            f"{known_by} of ScanNet++{'' if in_scene else ' have'}, so its axes, which are not "
+            "those of the scene's mesh, are undone"
+        )
+        doubt = "if the mesh has them"
+    doubt = "" if known else f"; state applied_transform {doubt}"
+    findings.warn(f"{source.name}: {said}{doubt}. [capture.legacy]")
+    return True
+
+
+def _old_axes_by_model(model: Path, frames: Sequence[Mapping[str, Any]]) -> bool | None:
     """Whether a document's poses are those of this model of COLMAP with the axes that nerfstudio
     gave them before 2023; None where the model does not tell, as it cannot be read or has not the
     same cameras."""

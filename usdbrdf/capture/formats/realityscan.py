@@ -36,6 +36,7 @@ from usdbrdf.capture.formats.named_pictures import (
 )
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
+from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import (
     Element,
     beginning_of,
@@ -81,7 +82,7 @@ def _sidecars(path: Path) -> list[Path]:
     """XMP files of this program in a folder, else in those below it and all below its pictures'."""
     deep = (path / name for name in FOLDERS if name)
     below = chain(path.glob("*/*.xmp"), *(folder.rglob("*.xmp") for folder in deep))
-    found = (sorted({*files}) for files in (path.glob("*.xmp"), below))
+    found = (sorted({*seen_of(files)}) for files in (path.glob("*.xmp"), below))
     return next((files for files in found if any(map(_is_sidecar, files))), [])
 
 

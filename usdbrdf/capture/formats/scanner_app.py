@@ -28,6 +28,7 @@ from usdbrdf.capture.parts import (
 from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import MAX_SIDE, image_size
+from usdbrdf.files.paths import seen_of
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import CaptureOptions
 
@@ -143,7 +144,9 @@ def _numbers(document: Mapping[str, Any], key: str, count: int) -> list[float] |
 
 
 def _mesh(folder: Path, options: CaptureOptions) -> Path:
-    others = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in (".ply", ".obj"))
+    others = sorted(
+        p.name for p in seen_of(folder.iterdir()) if p.suffix.lower() in (".ply", ".obj")
+    )
     for name in (*_MESHES, *others):
         path = path_in_capture(folder, name, options)
         if path.is_file():

@@ -28,6 +28,7 @@ from usdbrdf.capture.formats.scannet_objects import annotated_objects
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_text
 from usdbrdf.files.images import image_size
+from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import number_in, number_rows
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import CaptureOptions
@@ -49,7 +50,7 @@ def matches(path: Path) -> bool:
     if not ((path / "pose").is_dir() and (path / "color").is_dir()):
         return False
     named = any((path / name).is_file() for name in _LENSES)
-    return named or _described(path) is not None or any(path.glob(f"*{_MESH}"))
+    return named or _described(path) is not None or any(seen_of(path.glob(f"*{_MESH}")))
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:
@@ -63,7 +64,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     pictures = pictures_of(folder, options, "color")
     refuse_without_pictures(pictures, source)
     records = []
-    for file in sorted(source.glob("*.txt"), key=lambda file: (len(file.name), file.name)):
+    for file in sorted(seen_of(source.glob("*.txt")), key=lambda file: (len(file.name), file.name)):
         rows = number_rows(file)
         if [len(row) for row in rows] != [4] * 4:
             raise InputRefused(
@@ -105,7 +106,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
     how = f"Download the scene's *{_MESH}"
     mesh = partial(mesh_beside, folder, options, f"*{_MESH}", "*_vh_clean.ply", how=how)
-    meshes = [options.mesh] if options.mesh is not None else sorted(folder.glob(f"*{_MESH}"))
+    meshes = [options.mesh] if options.mesh is not None else seen_of(folder.glob(f"*{_MESH}"))
     segments = _objects_beside(meshes[0]) if meshes else ()
     return scan_of(
         records,

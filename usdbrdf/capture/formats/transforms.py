@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -17,15 +17,18 @@ from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.formats.named_pictures import Pictured, mesh_beside, path_in_capture, scan_of
 from usdbrdf.capture.formats.nerfstudio_frames import (
     EXPORTED,
+    TESTED,
     Applied,
     camera_axes,
     geometry_at_home,
-    old_axes_by_model,
+    has_old_axes,
+    is_bad,
     rigid_matrix,
     rolling_shutter,
     scene_above,
     stated_pose,
     statements_beside,
+    warn_of_bad,
 )
 from usdbrdf.capture.nerfstudio_lens import lens_of_frame
 from usdbrdf.capture.parts import geometry_from_file
@@ -44,10 +47,6 @@ from usdbrdf.options import CaptureOptions, UpAxis
 
 NAME = "transforms"
 DESCRIPTION = DESCRIPTIONS[NAME]
-# Folder of the reconstruction that old documents were made of.
-_COLMAP = "colmap/sparse/0"
-# ScanNet++'s keys for the frames it tests with, and of one that is blurred.
-_TESTED, _BAD = "test_frames", "is_bad"
 # No number in a document means anything beyond this; nor, where it must be positive, below its
 # inverse.
 _LARGEST = 1e15
@@ -147,6 +146,16 @@ def frame_records(
     return at_image_size(records, findings, source) if images else records
 
 
+def records_of_scene(
+    source: Path, pictures: Path, options: CaptureOptions, findings: Findings
+) -> list[FrameRecord]:
+    """The frames of a document of a scene of ScanNet++, whose pictures are those in a folder, with
+    the axes of the scene's mesh; without masks, which lie in a folder that it does not name."""
+    options = replace(options, frames=pictures)
+    _, records = _captured(source, options, findings, in_scene=True)
+    return [replace(record, mask_path=None) for record in records]
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Capture:
     """The document, its path, and what the user said.
@@ -208,10 +217,18 @@ class _Capture:
 
 
 def _captured(
-    source: Path, options: CaptureOptions, findings: Findings, *, images: bool = True
+    source: Path,
+    options: CaptureOptions,
+    findings: Findings,
+    *,
+    images: bool = True,
+    in_scene: bool = False,
 ) -> tuple[_Capture, list[FrameRecord]]:
-    """The document and its frames, but for those without pose or file."""
-    if (scene := scene_above(source)) is not None:
+    """The document and its frames, but for those without pose or file.
+
+    in_scene  whether it is read as a part of its scene of ScanNet++
+    """
+    if not in_scene and (scene := scene_above(source)) is not None:
         raise InputRefused(
             f"{source}: belongs to the scene of ScanNet++ in {scene}, whose mesh has other axes "
             "than its poses. Name that folder. [capture.format]"
@@ -220,7 +237,7 @@ def _captured(
     document = read_json(source, nonfinite_below=("transform_matrix",))
     frames = document.get("frames") if isinstance(document, dict) else None
     # ScanNet++ keeps those that it tests with, and says which are blurred.
-    tested = document.get(_TESTED, []) if isinstance(frames, list) else None
+    tested = document.get(TESTED, []) if isinstance(frames, list) else None
     frames = [*frames, *tested] if isinstance(frames, list) and isinstance(tested, list) else None
     if frames is None or not all(isinstance(frame, dict) for frame in frames):
         if said := other_program(source):
@@ -233,44 +250,21 @@ def _captured(
         said := other_program(source)
     ):
         raise InputRefused(f"{source}: {said}. [capture.format]")
-    beside = (source.parent / _COLMAP).is_dir()
-    unsaid = "applied_transform" not in document and (beside or _TESTED in document)
-    if unsaid and _TESTED in document:
-        findings.warn(
-            f"{source.name}: has {_TESTED}, as ScanNet++'s documents have, so its axes, which are "
-            "not those of its mesh, are undone; state applied_transform if the mesh has them. "
-            "[capture.legacy]"
-        )
-    known = old_axes_by_model(source.parent / _COLMAP, frames) if beside and unsaid else unsaid
-    legacy = known is None or known
-    if legacy and beside:
-        how = "are" if known else "are taken for"
-        doubt = "" if known else "; state applied_transform if they are not"
-        findings.warn(
-            f"{source.name}: {_COLMAP} lies beside it and it states no applied_transform, so its "
-            f"poses {how} those of nerfstudio before 2023, whose axes are undone{doubt}. "
-            "[capture.legacy]"
-        )
     capture = _Capture(
         source=source,
         document=document,
         options=options,
         pictured=Pictured(folder=source.parent, options=options),
         images=images,
-        is_legacy=legacy,
+        is_legacy=has_old_axes(source, document, frames, findings, in_scene=in_scene),
     )
     if any(any(rolling_shutter(frame)) for frame in (document, *frames)):
         findings.warn(
             f"{source.name}: states a rolling_shutter, which is not undone: what a camera took "
             "while it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
         )
-    sound = [(i, frame) for i, frame in enumerate(frames) if frame.get(_BAD) is not True]
-    if len(sound) < len(frames):
-        findings.count("frames_said_to_be_bad", len(frames) - len(sound))
-        findings.warn(
-            f"{source.name}: {len(frames) - len(sound)} of {len(frames)} frames are left out, of "
-            f"which it says {_BAD}. [capture.image]"
-        )
+    sound = [(i, frame) for i, frame in enumerate(frames) if not is_bad(frame)]
+    warn_of_bad(len(frames) - len(sound), len(frames), source.name, findings)
     records = [r for i, frame in sound if (r := _record(capture, frame, i, findings))]
     capture.pictured.warn_of_others(findings, source)
     return capture, records

@@ -119,6 +119,7 @@ def _records(
 ) -> Iterator[FrameRecord]:
     by_plate = options.frames is None and any(s.camera.images[s.i] for s in shots)
     if by_plate:
+        shots = _with_places(shots, findings)
         named = [(shot, _plate_file(shot, stage.parent, options)) for shot in shots]
     else:
         pictures = pictures_of(stage.parent, options)
@@ -135,6 +136,14 @@ def _records(
     others = _others(
         {shot.camera.path for shot, _ in named}, {s.camera.path for s, p in named if p}
     )
+    pictured = {shot.camera.path for shot, image in named if image}
+    beside = sorted({shot.camera.path for shot, _ in named} - pictured - others)
+    if by_plate and beside:
+        findings.warn(
+            f"{stage.name}: {len(beside)} cameras beside those of the photographs name no picture, "
+            f"first {beside[0]}, such as the second of a stereo pair; they are left out. "
+            "[capture.file]"
+        )
     for shot, image in named:
         if not shot.sampled and (image is None or not image.is_file()):
             continue
@@ -147,6 +156,19 @@ def _records(
             findings.drop(shot.name, "the image file does not exist", "capture.file")
         else:
             yield from _record(shot, image, findings)
+
+
+def _with_places(shots: list[_Shot], findings: Findings) -> list[_Shot]:
+    """The shots, without those of cameras that name one picture for many times, of which nobody
+    knows the one that it was taken at."""
+    of_all: dict[str, int] = {}
+    for shot in shots:
+        files = [image for image in shot.camera.images if image]
+        if len(files) > 1 and len({*files}) == 1:
+            of_all[shot.camera.path] = len(files)
+    for path, number in of_all.items():
+        findings.drop(path, f"it names one picture for {number} times", "capture.duplicate")
+    return [shot for shot in shots if shot.camera.path not in of_all]
 
 
 def _others(cameras: set[str], pictured: set[str]) -> set[str]:
@@ -221,14 +243,9 @@ def _identifiers(stem: str) -> set[str]:
 
 
 def _plate_file(shot: _Shot, folder: Path, options: CaptureOptions) -> Path | None:
-    """The file of a back plate, of a sequence too: plate.####.exr, plate.%04d.exr."""
     plate = shot.camera.images[shot.i]
     if not plate:
         return None
-    if not math.isnan(shot.time):
-        number = f"{round(shot.time)}"
-        plate = re.sub("#+", lambda m: number.zfill(len(m[0])), plate)
-        plate = re.sub(r"%0?(\d?)d", lambda m: number.zfill(int(m[1] or 1)), plate)
     inside = Path(plate).is_relative_to(folder)
     relative = Path(plate).relative_to(folder).as_posix() if inside else plate
     return path_in_capture(folder, relative, options)

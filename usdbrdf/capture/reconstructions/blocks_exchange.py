@@ -21,6 +21,7 @@ from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, scan_of_shots
 from usdbrdf.errors import InputRefused, MeshMissing
+from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import Element, beginning_of_text, files_of, numbers_of, read_xml
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -83,7 +84,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             f"{source.name}: pixels that are not square; AspectRatio is taken for the focal length "
             "down its pictures in parts of that across. [capture.camera]"
         )
-    tiles = sorted(source.parent.glob("Data/*/*.obj"))
+    tiles = seen_of(source.parent.glob("Data/*/*.obj"))
     return scan_of_shots(
         shots_of(block, _origin(source, system, options, findings), source),
         options,
@@ -142,12 +143,13 @@ def _system(root: Element, block: Element, source: Path) -> str:
     "" where it is stated nowhere. InputRefused where groups have several."""
     known = {_text(row, "Id"): _text(row, "Definition") for row in root.iter("SRS")}
     stated = {_text(each, "SRSId") for each in (block, *block.iter("Photogroup"))} - {""}
-    if len(stated) > 1:
+    # One may be listed twice, under an Id of its own of each program that added groups.
+    if len({_parts(known.get(each, "")) if known.get(each) else each for each in stated}) > 1:
         raise InputRefused(
             f"{source}: its photographs are in several coordinate systems (SRSId "
             f"{', '.join(sorted(stated))[:40]}). Export the block in one. [capture.unit]"
         )
-    return known.get(next(iter(stated), ""), "")
+    return known.get(min(stated, default=""), "")
 
 
 def _is_global(system: str) -> bool:

@@ -19,6 +19,7 @@ from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, scan_of_shot
 from usdbrdf.capture.rigid_poses import is_camera_matrix
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
+from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import numbers_among
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -56,7 +57,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "(--refine-poses). [capture.pose]"
         )
     mesh_from_world = _alignment(folder / "mesh_info.json", findings)
-    documents = sorted((folder / cameras).glob("*.json"))
+    documents = seen_of((folder / cameras).glob("*.json"))
     return scan_of_shots(
         [_shot(document, mesh_from_world) for document in documents],
         options,
@@ -75,7 +76,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 
 
 def _holds_any(folder: Path) -> bool:
-    return folder.is_dir() and any(folder.iterdir())
+    return folder.is_dir() and any(seen_of(folder.iterdir()))
 
 
 def _alignment(path: Path, findings: Findings) -> Double:
