@@ -92,6 +92,7 @@ SWEEPS = (
 NIGHTLY = (
     "cluster/test_workers.py::"
     "test_without_its_scheduler_a_run_ends_in_a_sentence_and_goes_on_from_there",
+    "cluster/test_workers.py::test_a_scheduler_that_is_started_anew_meanwhile_changes_no_byte",
     "dcc/test_nvidia.py::test_it_finds_nothing_in_any_variant_of_a_sound_asset",
     "faults/test_two_at_once.py::test_nobody_sees_half_a_run_and_an_artist_may_save",
     "faults/test_what_children_open.py::"

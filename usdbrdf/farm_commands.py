@@ -29,7 +29,7 @@ class Farm(OnCapture, Locking):
     list_file: Path | None = option("--list FILE", None, file=True)
     """text file that names scans, one a line, relative to its folder; lines that begin with "#" are
     comments"""
-    output: Path = option("-o --output DIR", REQUIRED)
+    output: Path = option("-o --output DIR", REQUIRED, one_line=True)
     "folder of the bundle, made if it is not there; the job's results go into it too"
     farm: FarmOptions
     options: ConvertOptions
@@ -63,9 +63,11 @@ class Farm(OnCapture, Locking):
 
 
 class _InBundle(Talking):
-    bundle: Path = option("BUNDLE", REQUIRED)
+    bundle: Path = option("BUNDLE", REQUIRED, one_line=True)
     "folder that usdbrdf farm wrote, or its scans.json in any place"
-    results: Path | None = option("--results DIR", None, unset="results, beside the list")
+    results: Path | None = option(
+        "--results DIR", None, unset="results, beside the list", one_line=True
+    )
     "folder of assets, pages and records, made if it is not there"
 
     def list_and_results(self) -> tuple[ScanList, Results]:
@@ -80,7 +82,9 @@ class _InBundle(Talking):
 class FarmWork(OnCapture, Locking, _InBundle):
     """Convert, validate and report scans of a bundle, as its tasks do."""
 
-    root: Path | None = option("--root DIR", None, unset="as when the list was written", empty=True)
+    root: Path | None = option(
+        "--root DIR", None, unset="as when the list was written", empty=True, one_line=True
+    )
     "folder above all scans"
     chosen: str | None = option("--scans RANGE", None, unset="all")
     "their numbers in the list, such as 3 or 1-5,8"

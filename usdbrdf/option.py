@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import typing
+import unicodedata
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from types import UnionType
@@ -32,6 +33,7 @@ class Option(NamedTuple):
     empty: bool = False  # an empty word is None, as a job gives it whose parameter has no value
     words: tuple[str, ...] = ()  # that may stand in the place of a file
     url: bool = False  # a text with :// in it may stand in the place of a path, and stays one
+    one_line: bool = False  # lines of text and other machines hold it: no control characters
     joined: bool = False  # given again it says more: the texts become one, with commas between
     shared: str = ""  # title in help, of what several tasks have
     help: str = ""  # its meaning, if that is not below the field
@@ -54,6 +56,11 @@ def option(said: str, default: T, limits: Any = (-math.inf, math.inf), **more: A
     return field(default=default, metadata={"option": told})
 
 
+def is_one_line(text: str) -> bool:
+    """Whether no control character or line break of any kind is in it."""
+    return not any(unicodedata.category(c) in ("Cc", "Zl", "Zp") for c in text)
+
+
 class OptionField(NamedTuple):
     """A field of an option class: its type without None, and its option; without option, ``kind``
     is an option class too."""
@@ -69,6 +76,12 @@ class OptionField(NamedTuple):
 
     def check(self, value: Any, subject: str) -> None:
         """Raise UsageError for a value that is none of the choices or out of the limits."""
+        if self.option is not None and self.option.one_line and not is_one_line(str(value)):
+            raise UsageError(
+                f"{self.option.name} {str(value)!r}: has a line break or another control character "
+                "in it, which a farm's jobs and a cluster's addresses cannot hold. Rename it, or "
+                "give another. [usage.option]"
+            )
         if self.option is not None and self.option.words and not isinstance(value, Path):
             if value is not None and value not in self.option.words:
                 words = " or ".join(self.option.words)

@@ -305,7 +305,7 @@ def test_what_no_store_is_called_is_refused_with_what_to_give(said: str, told: s
 
 def test_names_that_buckets_have_are_taken() -> None:
     point = "s3://arn:aws:s3:us-west-2:123456789012:accesspoint/some/prefix"
-    for said in ("s3://Some_old.bucket-1", "s3://b/a::b", "hdfs://host:9000/a", point):
+    for said in ("s3://Some_old.bucket-1", "s3://b/a:b", "hdfs://host:9000/a", point):
         assert ClusterOptions(shared_folder=said).shared_folder == said
 
 
@@ -321,6 +321,35 @@ def test_a_store_without_a_bucket_is_refused(said: str) -> None:
     """The first was taken for a folder of that name."""
     with pytest.raises(UsageError, match=r"names no bucket.*\[usage.option\]"):
         ClusterOptions(shared_folder=said)
+
+
+@pytest.mark.parametrize(
+    "said", ["s3://b/scans[1]", "s3://b/a*/c", "s3://b/a?versionId=3", "s3://b/a::b"]
+)
+def test_a_prefix_that_stands_for_more_than_itself_is_refused(said: str) -> None:
+    """What was uploaded below the first was never deleted: no object matched it."""
+    with pytest.raises(UsageError, match=r"stores read as more than that.*\[usage.option\]"):
+        ClusterOptions(shared_folder=said)
+    assert ClusterOptions(shared_folder="sftp://[::1]:22/scans").shared_folder is not None
+
+
+@pytest.mark.parametrize(
+    "prefix",
+    ["a b", "a+b", "a%20b", "100%", "ä 日本", "e\u0301", "a#b", "a//b", "a/../b", "~;&='\""],
+)
+def test_any_other_prefix_is_what_it_says(
+    server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prefix: str
+) -> None:
+    let_us_in(server, monkeypatch)
+    told = ClusterOptions(shared_folder=f"s3://{BUCKET}/keys/{prefix}").shared_folder
+    address = address_for(str(told), tmp_path / "ours")
+    ours, theirs = (Store(files_at(address, tmp_path / name)) for name in ("ours", "theirs"))
+    name = ours.keep(np.arange(1000.0))
+    ours.files.settle()
+    assert objects(f"s3://{BUCKET}/keys")[0].startswith(f"{prefix}/usdbrdf-")
+    np.testing.assert_array_equal(theirs.array(name), np.arange(1000.0))
+    forget(str(told), tmp_path / "ours")
+    assert objects(f"s3://{BUCKET}/keys") == []
 
 
 def test_a_store_that_is_asked_at_once_and_does_not_answer_is_a_sentence(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import socket
@@ -13,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import psutil
 import pytest
@@ -197,9 +198,12 @@ def test_workers_of_other_code_are_refused_in_a_sentence(
         pipeline.shade(copy, SHADE, workers)
 
 
+Cluster: TypeAlias = tuple[str, Callable[..., subprocess.Popen[bytes]]]
+
+
 @pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """Address of a scheduler that is a process of its own, with a worker; and that process."""
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    """Address of a scheduler, and what starts it as a process of its own, with a worker."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
@@ -210,24 +214,28 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
         nowhere = subprocess.DEVNULL
         return subprocess.Popen(command, stdout=nowhere, stderr=nowhere, cwd=tmp_path)
 
-    scheduler = started("dask_scheduler", "--host", "127.0.0.1", "--port", port)
-    worker = started("dask_worker", address, "--nthreads", "1", "--no-nanny")
+    begun: list[subprocess.Popen[bytes]] = []
+
+    def start(*of_worker: str) -> subprocess.Popen[bytes]:
+        begun.append(started("dask_scheduler", "--host", "127.0.0.1", "--port", port))
+        words = "--nthreads", "1", "--no-nanny", *of_worker
+        begun.append(started("dask_worker", address, *words))
+        return begun[-2]
+
     try:
-        yield address, scheduler
+        yield address, start
     finally:
-        for process in (worker, scheduler):
+        for process in begun:
             process.kill()
             process.wait()
 
 
 def test_without_its_scheduler_a_run_ends_in_a_sentence_and_goes_on_from_there(
-    copy: Asset,
-    alone: dict[str, str],
-    cluster: tuple[str, subprocess.Popen[bytes]],
-    monkeypatch: pytest.MonkeyPatch,
+    copy: Asset, alone: dict[str, str], cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    address, scheduler = cluster
-    strike(monkeypatch, 3, scheduler.kill)
+    address, start = cluster
+    # The first six are no units: light that is found in this process.
+    strike(monkeypatch, 8, start().kill)
     with (
         workers_of(ClusterOptions(scheduler=address)) as workers,
         pytest.raises(EnvironmentFailure, match=r"scheduler is gone.*\[cluster.scheduler\]"),
@@ -239,7 +247,71 @@ def test_without_its_scheduler_a_run_ends_in_a_sentence_and_goes_on_from_there(
         workers_of(ClusterOptions(scheduler=address)) as workers,
     ):
         pipeline.shade(copy, SHADE, workers)
-    pipeline.shade(copy, SHADE)
+    start()
+    with workers_of(ClusterOptions(scheduler=address)) as workers:
+        pipeline.shade(copy, SHADE, workers)
+        pipeline.fit(copy, FIT, workers)
+    assert contents(copy.folder) == alone
+
+
+def test_a_scheduler_that_is_started_anew_meanwhile_changes_no_byte(
+    copy: Asset, alone: dict[str, str], cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It knows nothing of the units that are out. The run goes on, or ends in a sentence where the
+    new one comes late."""
+    address, start = cluster
+    first, second = start(), list[int]()
+
+    def renew() -> None:
+        first.kill()
+        first.wait()
+        second.append(start().pid)
+
+    # The first six are no units: light that is found in this process.
+    strike(monkeypatch, 8, renew)
+    chosen = ClusterOptions(scheduler=address)
+    failures: list[str] = []
+    for _ in range(2):
+        try:
+            with workers_of(chosen) as workers:
+                pipeline.shade(copy, SHADE, workers)
+        except EnvironmentFailure as failure:
+            failures.append(str(failure))
+    assert len(failures) < 2
+    assert all(re.search(r"\[cluster.scheduler\]$", failure) for failure in failures)
+    assert second
+    pipeline.fit(copy, FIT)
+    assert contents(copy.folder) == alone
+
+
+_FULL = """
+import errno
+from usdbrdf.cluster.store import Store
+
+def full(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+Store.keep_result = full
+"""
+
+
+def test_a_worker_whose_disk_is_full_is_a_sentence_and_another_goes_on_from_there(
+    copy: Asset, alone: dict[str, str], cluster: Cluster, tmp_path: Path
+) -> None:
+    address, start = cluster
+    (tmp_path / "full.py").write_text(_FULL)
+    scheduler = start("--preload", str(tmp_path / "full.py"))
+    chosen = ClusterOptions(scheduler=address)
+    with (
+        pytest.raises(EnvironmentFailure, match=r"No space left.*disk is full.*cluster.worker\]"),
+        workers_of(chosen) as workers,
+    ):
+        pipeline.shade(copy, SHADE, workers)
+    scheduler.kill()
+    scheduler.wait()
+    start()
+    with workers_of(chosen) as workers:
+        pipeline.shade(copy, SHADE, workers)
     pipeline.fit(copy, FIT)
     assert contents(copy.folder) == alone
 

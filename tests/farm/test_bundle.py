@@ -15,6 +15,7 @@ from tests.fault_injection import run_fresh
 from tests.json_schemas import checked
 from tests.scenes import make_capture
 from usdbrdf.cli import main
+from usdbrdf.cluster.options import ClusterOptions
 from usdbrdf.commands import COMMANDS
 from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, UsageError
 from usdbrdf.farm import bundle as bundles
@@ -228,6 +229,38 @@ def test_a_scan_that_is_not_there_is_said_at_once(tmp_path, capsys):
     assert not (tmp_path / "o").exists()
     assert main(["farm", "-o", str(tmp_path / "o")]) == 2
     assert main(["farm", str(there), "-o", str(tmp_path / "o"), "--texel-size", "0"]) == 2
+
+
+@pytest.mark.parametrize("character", ["\n", "\r", "\x1b", "\u2028"])
+def test_no_job_holds_names_that_break_its_lines(tmp_path, capsys, character):
+    broken = tmp_path / f"a{character}b"
+    good, inside, other = folders(tmp_path, "a", f"{broken.name}/c", f"{broken.name}/d")
+    bundle = str(tmp_path / "o")
+
+    def refused(*words: str) -> str:
+        status = main([*words, "-q"])
+        said = capsys.readouterr().err
+        assert repr(str(broken)) in said
+        assert status in (2, 3)
+        assert len(said.splitlines()) == 1
+        return said
+
+    assert "[farm.scan]" in refused("farm", str(inside), str(other), "-o", bundle)
+    assert "-o" in refused("farm", str(good), "-o", str(broken))
+    assert [*broken.iterdir()] == [inside, other]
+    assert not (tmp_path / "o").exists()
+    # In the list alone such a name does no harm.
+    assert main(["farm", str(good), str(inside), "-o", bundle, "-q"]) == 0
+    assert "--root" in refused("farm-work", bundle, "--root", str(broken))
+    assert "--results" in refused("farm-work", bundle, "--results", str(broken))
+    assert "--results" in refused("farm-table", bundle, "--results", str(broken))
+    assert "BUNDLE" in refused("farm-table", str(broken))
+    assert not (tmp_path / "o/results").exists()
+    assert "--shared-folder" in refused("shade", str(good), "--shared-folder", str(broken))
+    with pytest.raises(UsageError, match="--shared-folder 's3://a"):
+        ClusterOptions(shared_folder=f"s3://a/b{character}c")
+    with pytest.raises(UsageError, match="--scheduler"):
+        ClusterOptions(scheduler=f"tcp://head{character}:8786")
 
 
 def test_scans_come_from_a_file_too(tmp_path):

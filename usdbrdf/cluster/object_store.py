@@ -12,6 +12,7 @@ import errno
 import re
 import secrets
 import shutil
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,6 +30,9 @@ from usdbrdf.job.progress import say
 T = TypeVar("T")
 # Uploads at a time, and those that wait, for which arrays stay in memory.
 _AT_ONCE, _WAITING = 8, 32
+# Seconds between tries to read an object, of which a part came, or something else: libraries try
+# again where they are told of an error alone. After the latter they have tried for long enough.
+_BETWEEN_READS, _LONGEST_READ = (0.2, 1.0, 3.0), 60.0
 _NOTE = "prefix.txt"
 
 
@@ -96,15 +100,26 @@ class Objects(Files):
         if to.is_file() and sha256_of(to) == name[:DIGITS]:
             return to
         to.parent.mkdir(parents=True, exist_ok=True)
+        begun, waits = time.monotonic(), iter(_BETWEEN_READS)
+        while True:
+            try:
+                self._copy(name, to)
+                return to
+            except _Passing:
+                wait = next(waits, None)
+                if wait is None or time.monotonic() - begun > _LONGEST_READ:
+                    raise
+                time.sleep(wait)
+
+    def _copy(self, name: str, to: Path) -> None:
         with temporary_beside(to) as staged:
             self._asked(lambda: self._system.get_file(self._at(name), str(staged)))
             if sha256_of(staged) != name[:DIGITS]:
-                raise EnvironmentFailure(
+                raise _Passing(
                     f"{self.address}/{name}: is not what its name tells. Delete it in the store, "
                     "then run the same command again. [cluster.objects]"
                 )
             staged.replace(to)
-        return to
 
     def drop(self, name: str) -> None:
         """What cannot be deleted now goes with all the others."""
@@ -202,7 +217,7 @@ class Objects(Files):
                 f"--shared-folder {self.address}: is no place in an object store ({said[:200]}). "
                 "Correct it. [cluster.objects]"
             )
-        return EnvironmentFailure(
+        return _Passing(
             f"{self.address}: the object store failed ({kind}: {said}). See whether this machine "
             "reaches it, then run the same command again; finished work is kept. [cluster.objects]"
         )
@@ -210,6 +225,10 @@ class Objects(Files):
 
 class _Missing(EnvironmentFailure):
     """There is no such object, or nowhere to have one."""
+
+
+class _Passing(EnvironmentFailure):
+    """What another try may not meet again."""
 
 
 def files_at(address: str | Path, copies: Path) -> Files:

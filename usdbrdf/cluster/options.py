@@ -6,11 +6,14 @@ import re
 from pathlib import Path
 
 from usdbrdf.errors import UsageError
-from usdbrdf.option import Options, option
+from usdbrdf.option import Options, is_one_line, option
 
 # Hosts, without a scheme or with any that Dask has learnt, and a port where there is one.
 _ADDRESS = re.compile(r"(?!\w*://(?:[/:]|\Z))[^\s/:]\S*", re.ASCII)
 _PORT = re.compile(r":(\d+)\Z", re.ASCII)
+# What the libraries of object stores read as a pattern, a version, or the end of one URL and the
+# begin of another; a host may be in brackets.
+_PATTERN = re.compile(r"[^/]*//[^/]*/.*([*?[]|::)", re.DOTALL)
 # What may be called a bucket of S3, or an access point to one.
 _OF_S3 = re.compile(r"s3a?://(?:[\w.-]{1,255}|arn:[^\s/]+)(?:/.*)?", re.DOTALL | re.ASCII)
 # What a URL has between its scheme and a prefix; of files that is the prefix.
@@ -32,7 +35,7 @@ class ClusterOptions(Options):
     scheduler: str | None = option("--scheduler ADDRESS", None)
     "do it on the workers of a Dask cluster, such as tls://HOST:8786, that are installed as this is"
     shared_folder: Path | str | None = option(
-        "--shared-folder DIR|URL", None, unset="in the asset", url=True
+        "--shared-folder DIR|URL", None, unset="in the asset", url=True, one_line=True
     )
     """folder that all workers see under this name, for what they work with, or an object store,
     such as s3://BUCKET/PREFIX, by which they get photographs too"""
@@ -46,7 +49,7 @@ class ClusterOptions(Options):
             raise UsageError("--workers, --scheduler: they exclude each other. [usage.option]")
         if self.scheduler is not None and not _is_address(self.scheduler):
             raise UsageError(
-                f"--scheduler {self.scheduler}: is no address of a scheduler. Give one such as "
+                f"--scheduler {self.scheduler!r}: is no address of a scheduler. Give one such as "
                 "tls://HOST:8786. [usage.option]"
             )
         if is_url(self.shared_folder) and (why := _why_no_store(str(self.shared_folder))):
@@ -60,7 +63,8 @@ class ClusterOptions(Options):
 
 def _is_address(text: str) -> bool:
     port = _PORT.search(text)
-    return bool(_ADDRESS.fullmatch(text)) and (port is None or 0 < int(port[1]) < 1 << 16)
+    named = _ADDRESS.fullmatch(text) is not None and is_one_line(text)
+    return named and (port is None or 0 < int(port[1]) < 1 << 16)
 
 
 def _why_no_store(url: str) -> str:
@@ -72,6 +76,8 @@ def _why_no_store(url: str) -> str:
         return f"names no bucket or host. {such}"
     if url.startswith(("s3:", "s3a:")) and not _OF_S3.fullmatch(url):
         return f"no bucket can be called so. {such}"
+    if _PATTERN.match(url):
+        return f"has *, ?, [ or :: in it, which stores read as more than that. {such}"
     if url.startswith("memory:"):
         return f"no other process sees this one's memory. {such}"
     return ""

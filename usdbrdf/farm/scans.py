@@ -13,6 +13,7 @@ from usdbrdf.capture.adapters import choose_adapter
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.documents import read_json, read_text
 from usdbrdf.files.naming import unique_identifiers
+from usdbrdf.option import is_one_line
 
 SCANS_FILE = "scans.json"
 RESULTS_FOLDER = "results"
@@ -66,6 +67,12 @@ def list_of(scans: Sequence[Path], known: Mapping[str, Path] | None = None) -> S
         )
     places = [place for place in places if not _is_read_with_its_folder(place, once)]
     root = Path(os.path.commonpath([place.parent for place in places]))
+    if not is_one_line(str(root)):
+        raise InputRefused(
+            f"{str(root)!r}: this folder above the scans has a line break or another control "
+            "character in its name, which a farm's jobs cannot hold. Rename it; nothing was "
+            "written. [farm.scan]"
+        )
     return ScanList(
         root=root,
         names=tuple(_names(places, known or {})),
