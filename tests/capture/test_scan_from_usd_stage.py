@@ -290,6 +290,84 @@ def test_a_camera_that_moves_before_one_picture_is_left_out(tmp_path, room):
     assert any("'/room/camera': it names one picture for 10 times" in w for w in scan.warnings)
 
 
+def test_a_sequence_in_a_stage_of_another_rate_has_its_whole_times(tmp_path, room):
+    """Of a layer of 24 frames a second, in a stage of 25, 120 comes out as 125.00000000000001."""
+    stage = make_stage(tmp_path / "shot" / "parts" / "room.usda", room)
+    stage.SetTimeCodesPerSecond(24)
+    camera = UsdGeom.Camera.Define(stage, "/room/camera")
+    place, turn = camera.AddTranslateOp(), camera.AddRotateXYZOp()
+    for time, x, turned in ((120, 1.4, 10.0), (240, 2.6, 60.0), (360, 1.5, 130.0), (480, 1.6, 200)):
+        place.Set(Gf.Vec3d(x, 1 + time / 600, 1.5), time)
+        turn.Set(Gf.Vec3f(72.0, 5.0, turned), time)
+    _set_lens(camera, room.intrinsics[0])
+    named_plate(camera.GetPrim()).Set(Sdf.AssetPath("../plates/p.####.exr"))
+    stage.Save()
+    whole = Usd.Stage.CreateNew(str(tmp_path / "shot" / "shot.usda"))
+    whole.SetTimeCodesPerSecond(25)
+    UsdGeom.SetStageUpAxis(whole, "Z")
+    UsdGeom.SetStageMetersPerUnit(whole, 1.0)
+    whole.GetRootLayer().subLayerPaths.append("./parts/room.usda")
+    whole.SetDefaultPrim(whole.GetPrimAtPath("/room"))
+    whole.Save()
+    times = (125, 150, 200, 225, 250, 300, 375, 425, 450, 500)
+    for time, image in zip(times, room.images, strict=True):
+        write_image(tmp_path / "shot" / "plates" / f"p.{time:04d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    camera = UsdGeom.Camera(whole.GetPrimAtPath("/room/camera"))
+    assert 125.0 not in UsdGeom.Xformable(camera).GetTimeSamples()
+    assert_same(scan, room, poses=poses_at(camera, times))
+
+
+def test_a_name_that_is_written_again_lasts(tmp_path, room):
+    """As of programs that write every attribute at every frame."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    moving_camera(stage, room)
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/room/camera"))
+    plate = named_plate(camera.GetPrim())
+    for i in range(10):
+        for time in (101 + i, 101.25 + i, 101.5 + i):
+            plate.Set(Sdf.AssetPath(f"./plates/{9 - i}.exr"), time)
+        write_image(tmp_path / "shot" / "plates" / f"{9 - i}.exr", room.images[i])
+    stage.Save()
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room)
+
+
+@pytest.mark.parametrize("written", ["once", "at each time"])
+def test_a_camera_that_stands_still_has_one_picture_however_often_it_is_written(
+    tmp_path, room, written
+):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    many_cameras(stage, room)
+    for i, (image, pose) in enumerate(zip(room.images, room.world_from_camera, strict=True)):
+        camera = UsdGeom.Camera(stage.GetPrimAtPath(f"/shots/IMG_{i:03d}"))
+        (place,) = camera.GetOrderedXformOps()
+        plate = named_plate(camera.GetPrim())
+        plate.Set(Sdf.AssetPath(f"./plates/IMG_{i:03d}.exr"))
+        for time in range(12):
+            place.Set(Gf.Matrix4d(pose.T.tolist()), time)
+            _set_lens(camera, room.intrinsics[i], time=time)
+            if written != "once":
+                plate.Set(Sdf.AssetPath(f"./plates/IMG_{i:03d}.exr"), time)
+        write_image(tmp_path / "shot" / "plates" / f"IMG_{i:03d}.exr", image)
+    stage.Save()
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room)
+
+
+def test_a_plates_name_may_hold_any_number_of_digits(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    many_cameras(stage, room)
+    for i, image in enumerate(room.images):
+        prim = stage.GetPrimAtPath(f"/shots/IMG_{i:03d}")
+        named_plate(prim).Set(Sdf.AssetPath(f"./plates/{i}.exr"))
+        write_image(tmp_path / "shot" / "plates" / f"{i}.exr", image)
+    moving_camera(stage, room)
+    named_plate(stage.GetPrimAtPath("/room/camera")).Set(Sdf.AssetPath(f"./{'1' * 5000}.exr"))
+    stage.Save()
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room)
+    assert any("'/room/camera': it names one picture for 10 times" in w for w in scan.warnings)
+
+
 def test_a_camera_with_few_keys_is_where_usd_interpolates_it(tmp_path, room):
     stage = make_stage(tmp_path / "shot" / "room.usda", room)
     camera = UsdGeom.Camera.Define(stage, "/room/camera")
