@@ -90,6 +90,19 @@ def test_many_cameras_find_their_pictures_by_name(tmp_path, room):
     assert scan.usd_geometry == tmp_path / "shot" / "room.usda"
 
 
+def test_what_lies_in_hidden_folders_is_passed_over_but_not_a_capture_in_one(tmp_path, room):
+    """As programs keep small pictures there; each name is in the capture twice then."""
+    folder = tmp_path / ".cache" / "shot"
+    stage = make_stage(folder / "room.usda", room)
+    many_cameras(stage, room)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        for place in ("images", "images/.thumbnails"):
+            write_image(folder / place / f"IMG-{i:03d}.exr", image)
+    assert choose_adapter(folder).name == "usd"
+    assert_same(read_scan(folder, IngestOptions()), room, names=room.names)
+
+
 @pytest.mark.parametrize("number", [math.nan, math.inf])
 def test_a_camera_without_a_finite_place_costs_its_picture_alone(tmp_path, room, number):
     stage = make_stage(tmp_path / "room.usda", room)
