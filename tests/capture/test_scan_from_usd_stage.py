@@ -17,6 +17,7 @@ from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.ingest import ingest
+from usdbrdf.untrusted.usd_cameras import _camera
 
 
 @pytest.fixture
@@ -364,6 +365,20 @@ def test_a_camera_that_stands_still_has_one_picture_however_often_it_is_written(
         write_image(tmp_path / "shot" / "plates" / f"IMG_{i:03d}.exr", image)
     stage.Save()
     assert_same(read_scan(tmp_path / "shot", IngestOptions()), room)
+
+
+def test_a_camera_that_usd_interpolates_between_equal_keys_stands_still():
+    stage = Usd.Stage.CreateInMemory()
+    camera = UsdGeom.Camera.Define(stage, "/camera")
+    place, turn = camera.AddTranslateOp(), camera.AddRotateXYZOp()
+    named_plate(camera.GetPrim()).Set(Sdf.AssetPath("/plates/IMG_003.exr"))
+    for time in (0, 37):
+        place.Set(Gf.Vec3d(0.1, 2.7182, 1.4142), time)
+        turn.Set(Gf.Vec3f(72.123, 5.456, 130.789), time)
+    assert len(np.unique(poses_at(camera, range(38)), axis=0)) > 1
+    assert _camera(camera).images == ("/plates/IMG_003.exr",)
+    place.Set(Gf.Vec3d(0.1, 2.7182, 1.5), 37)
+    assert len(_camera(camera).images) == 38
 
 
 def test_a_plates_name_may_hold_any_number_of_digits(tmp_path, room):

@@ -24,7 +24,7 @@ _MOST_BETWEEN = 10_000  # times of one camera
 _NUMBER = re.compile(r"#+|%0?(\d?)d")
 # And the number of one of its pictures: plate.0103.exr.
 _OWN_NUMBER = re.compile(r"(?<![0-9])[0-9]{1,9}(?=\.[^.]*$)")
-_ROUNDING = 1e-6  # of times that a layer of another rate scales
+_ROUNDING = 1e-6  # of times that a layer of another rate scales, and of what is interpolated
 _SHAPE = "verticalAperture"
 _LENS = (
     "focalLength",
@@ -140,9 +140,9 @@ def _whole(time: float) -> float:
     return whole if abs(time - whole) < _ROUNDING else time
 
 
-def _is_one(rows: Sequence[object]) -> bool:
-    """Whether what a camera has at several times is one and the same."""
-    return bool(np.array_equal(np.array(rows), np.array([rows[0]] * len(rows)), equal_nan=True))
+def _is_one(rows: Sequence[Any]) -> bool:
+    """Whether what a camera has at several times is one and the same, but for rounding."""
+    return bool(np.allclose(rows, rows[0], _ROUNDING, _ROUNDING, equal_nan=True))
 
 
 def _names_of_plates(prim: Usd.Prim) -> list[str]:
