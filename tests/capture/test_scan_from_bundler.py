@@ -70,6 +70,13 @@ def test_the_list_is_found_above_the_folder_of_bundler(tmp_path, named):
     assert files_beside(choose_adapter(tmp_path), tmp_path, None) == []
 
 
+def test_half_of_a_list_that_an_archive_of_a_mac_brings_is_none(tmp_path):
+    room = truth().centred()
+    _write(tmp_path, room, _document(room), "bundle/bundle.out")
+    (tmp_path / "bundle/._list.txt").write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X")
+    assert_same(read_scan(tmp_path / "bundle", OPTIONS), room)
+
+
 def test_a_capture_may_be_called_as_the_folder_of_bundler(tmp_path):
     room = truth().centred()
     _write(tmp_path / "bundle", room, _document(room))

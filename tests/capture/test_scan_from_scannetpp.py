@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -262,6 +264,25 @@ def test_a_telephones_model_without_pictures_is_not_taken_for_the_document_with_
     (scene / "iphone").mkdir()
     (scene / "dslr" / "colmap").rename(scene / "iphone" / "colmap")
     assert_same(read_scan(scene, OPTIONS), room)
+
+
+@pytest.mark.parametrize("named", ["../resized_anon_masks/DSC00004.png", ""])
+def test_masks_of_a_scene_are_its_folders_whatever_its_document_calls_them(scene, room, named):
+    _without_model(scene, room)
+    document = scene / "dslr" / "nerfstudio" / "transforms.json"
+    said = json.loads(document.read_text())
+    said["frames"][4]["mask_path"] = named
+    document.write_text(json.dumps(said))
+    assert_same(read_scan(scene, OPTIONS), room)
+
+
+def test_pictures_that_are_named_are_those_of_the_camera_that_they_lie_at(scene, room):
+    shutil.copytree(scene / "dslr" / "colmap", scene / "iphone" / "colmap")
+    (scene / "dslr" / "resized_images").rename(scene / "iphone" / "rgb")
+    images = scene / "dslr" / "colmap" / "images.txt"
+    images.write_text(images.read_text().replace("DSC", "P"))
+    options = replace(OPTIONS, frames=scene / "iphone" / "rgb")
+    assert_same(read_scan(scene, options), room)
 
 
 def _alone(folder, room):

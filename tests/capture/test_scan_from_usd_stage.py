@@ -17,6 +17,7 @@ from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.ingest import ingest
+from usdbrdf.untrusted.usd_cameras import _camera
 
 
 @pytest.fixture
@@ -88,6 +89,19 @@ def test_many_cameras_find_their_pictures_by_name(tmp_path, room):
     assert_same(scan, room, points=room.points * 100, poses=poses, names=room.names)
     assert (scan.adapter, scan.up_axis, round(scan.meters_per_unit, 9)) == ("usd", "Z", 0.01)
     assert scan.usd_geometry == tmp_path / "shot" / "room.usda"
+
+
+def test_what_lies_in_hidden_folders_is_passed_over_but_not_a_capture_in_one(tmp_path, room):
+    """As programs keep small pictures there; each name is in the capture twice then."""
+    folder = tmp_path / ".cache" / "shot"
+    stage = make_stage(folder / "room.usda", room)
+    many_cameras(stage, room)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        for place in ("images", "images/.thumbnails"):
+            write_image(folder / place / f"IMG-{i:03d}.exr", image)
+    assert choose_adapter(folder).name == "usd"
+    assert_same(read_scan(folder, IngestOptions()), room, names=room.names)
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf])
@@ -284,6 +298,98 @@ def test_a_camera_that_moves_before_one_picture_is_left_out(tmp_path, room):
         write_image(tmp_path / "shot" / "plates" / f"{i}.exr", image)
     moving_camera(stage, room)
     named_plate(stage.GetPrimAtPath("/room/camera")).Set(Sdf.AssetPath("./plates/3.exr"))
+    stage.Save()
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room)
+    assert any("'/room/camera': it names one picture for 10 times" in w for w in scan.warnings)
+
+
+def test_a_sequence_in_a_stage_of_another_rate_has_its_whole_times(tmp_path, room):
+    """Of a layer of 24 frames a second, in a stage of 25, 120 comes out as 125.00000000000001."""
+    stage = make_stage(tmp_path / "shot" / "parts" / "room.usda", room)
+    stage.SetTimeCodesPerSecond(24)
+    camera = UsdGeom.Camera.Define(stage, "/room/camera")
+    place, turn = camera.AddTranslateOp(), camera.AddRotateXYZOp()
+    for time, x, turned in ((120, 1.4, 10.0), (240, 2.6, 60.0), (360, 1.5, 130.0), (480, 1.6, 200)):
+        place.Set(Gf.Vec3d(x, 1 + time / 600, 1.5), time)
+        turn.Set(Gf.Vec3f(72.0, 5.0, turned), time)
+    _set_lens(camera, room.intrinsics[0])
+    named_plate(camera.GetPrim()).Set(Sdf.AssetPath("../plates/p.####.exr"))
+    stage.Save()
+    whole = Usd.Stage.CreateNew(str(tmp_path / "shot" / "shot.usda"))
+    whole.SetTimeCodesPerSecond(25)
+    UsdGeom.SetStageUpAxis(whole, "Z")
+    UsdGeom.SetStageMetersPerUnit(whole, 1.0)
+    whole.GetRootLayer().subLayerPaths.append("./parts/room.usda")
+    whole.SetDefaultPrim(whole.GetPrimAtPath("/room"))
+    whole.Save()
+    times = (125, 150, 200, 225, 250, 300, 375, 425, 450, 500)
+    for time, image in zip(times, room.images, strict=True):
+        write_image(tmp_path / "shot" / "plates" / f"p.{time:04d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    camera = UsdGeom.Camera(whole.GetPrimAtPath("/room/camera"))
+    assert 125.0 not in UsdGeom.Xformable(camera).GetTimeSamples()
+    assert_same(scan, room, poses=poses_at(camera, times))
+
+
+def test_a_name_that_is_written_again_lasts(tmp_path, room):
+    """As of programs that write every attribute at every frame."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    moving_camera(stage, room)
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/room/camera"))
+    plate = named_plate(camera.GetPrim())
+    for i in range(10):
+        for time in (101 + i, 101.25 + i, 101.5 + i):
+            plate.Set(Sdf.AssetPath(f"./plates/{9 - i}.exr"), time)
+        write_image(tmp_path / "shot" / "plates" / f"{9 - i}.exr", room.images[i])
+    stage.Save()
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room)
+
+
+@pytest.mark.parametrize("written", ["once", "at each time"])
+def test_a_camera_that_stands_still_has_one_picture_however_often_it_is_written(
+    tmp_path, room, written
+):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    many_cameras(stage, room)
+    for i, (image, pose) in enumerate(zip(room.images, room.world_from_camera, strict=True)):
+        camera = UsdGeom.Camera(stage.GetPrimAtPath(f"/shots/IMG_{i:03d}"))
+        (place,) = camera.GetOrderedXformOps()
+        plate = named_plate(camera.GetPrim())
+        plate.Set(Sdf.AssetPath(f"./plates/IMG_{i:03d}.exr"))
+        for time in range(12):
+            place.Set(Gf.Matrix4d(pose.T.tolist()), time)
+            _set_lens(camera, room.intrinsics[i], time=time)
+            if written != "once":
+                plate.Set(Sdf.AssetPath(f"./plates/IMG_{i:03d}.exr"), time)
+        write_image(tmp_path / "shot" / "plates" / f"IMG_{i:03d}.exr", image)
+    stage.Save()
+    assert_same(read_scan(tmp_path / "shot", IngestOptions()), room)
+
+
+def test_a_camera_that_usd_interpolates_between_equal_keys_stands_still():
+    stage = Usd.Stage.CreateInMemory()
+    camera = UsdGeom.Camera.Define(stage, "/camera")
+    place, turn = camera.AddTranslateOp(), camera.AddRotateXYZOp()
+    named_plate(camera.GetPrim()).Set(Sdf.AssetPath("/plates/IMG_003.exr"))
+    for time in (0, 37):
+        place.Set(Gf.Vec3d(0.1, 2.7182, 1.4142), time)
+        turn.Set(Gf.Vec3f(72.123, 5.456, 130.789), time)
+    assert len(np.unique(poses_at(camera, range(38)), axis=0)) > 1
+    assert _camera(camera).images == ("/plates/IMG_003.exr",)
+    place.Set(Gf.Vec3d(0.1, 2.7182, 1.5), 37)
+    assert len(_camera(camera).images) == 38
+
+
+def test_a_plates_name_may_hold_any_number_of_digits(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    many_cameras(stage, room)
+    for i, image in enumerate(room.images):
+        prim = stage.GetPrimAtPath(f"/shots/IMG_{i:03d}")
+        named_plate(prim).Set(Sdf.AssetPath(f"./plates/{i}.exr"))
+        write_image(tmp_path / "shot" / "plates" / f"{i}.exr", image)
+    moving_camera(stage, room)
+    named_plate(stage.GetPrimAtPath("/room/camera")).Set(Sdf.AssetPath(f"./{'1' * 5000}.exr"))
     stage.Save()
     scan = read_scan(tmp_path / "shot", IngestOptions())
     assert_same(scan, room)

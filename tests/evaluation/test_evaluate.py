@@ -20,6 +20,7 @@ from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.evaluation.metrics import compare_with_truth, true_albedo
 from usdbrdf.evaluation.report import write_plot
 from usdbrdf.files.images import image_size, read_exr
+from usdbrdf.job.progress import set_quiet
 
 LOW = usdbrdf.EvaluateOptions(samples_per_pixel=4, rays=32)
 
@@ -66,6 +67,21 @@ def test_the_summary_is_of_all_views(found):
         assert summary[metric]["worse_views"] == worse
     flip = summary["flip"]
     assert 1 + flip["change_percent"] / 100 == pytest.approx(flip["full"] / flip["baseline"])
+
+
+def test_light_of_primaries_that_are_not_known_is_told_and_that_of_no_file_as_such(
+    room, views, tmp_path, capsys
+):
+    file = tmp_path / "sky.hdr"
+    primaries = b"PRIMARIES=0.6 0.3 0.3 0.5 0.2 0.1 0.3 0.3\n"
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n" + primaries + b"\n-Y 2 +X 4\n"
+    file.write_bytes(head + bytes([64, 128, 64, 129]) * 8)
+    set_quiet(False)
+    usdbrdf.evaluate(room.asset, views.manifest, tmp_path / "a", replace(LOW, environment=file))
+    assert capsys.readouterr().err.count("[light.primaries]") == 1
+    file.unlink()
+    with pytest.raises(InputRefused, match=r"sky\.hdr: this picture does not exist.*\[picture"):
+        usdbrdf.evaluate(room.asset, views.manifest, tmp_path / "b", replace(LOW, environment=file))
 
 
 def test_all_files_are_there(found):

@@ -151,6 +151,11 @@ def test_what_systems_leave_beside_files_is_not_seen(tmp_path):
         (tmp_path / name).touch()
     assert [p.name for p in seen_of(tmp_path.iterdir())] == ["a.b.ply", "a.ply", "b.ply"]
     assert files_of(tmp_path, [".ply"]) == seen_of(tmp_path.iterdir())
+    hidden = tmp_path / ".thumbnails" / "c.ply"
+    hidden.parent.mkdir()
+    hidden.touch()
+    assert hidden not in seen_of(tmp_path.rglob("*"), below=tmp_path)
+    assert seen_of(hidden.parent.rglob("*"), below=hidden.parent) == [hidden]
     # Who names one means it.
     assert files_of(tmp_path / "._a.ply", [".ply"]) == [tmp_path / "._a.ply"]
 

@@ -196,7 +196,7 @@ def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, 
     if not path.is_dir():
         return
     for pattern in ("*/", "*/*/"):
-        for folder in seen_of(path.glob(pattern))[:_MOST_BELOW]:
+        for folder in seen_of(path.glob(pattern), below=path)[:_MOST_BELOW]:
             for adapter in sound:
                 if adapter.module and adapter.name in MODULES and adapter.module.matches(folder):
                     yield folder.relative_to(path), adapter

@@ -276,9 +276,9 @@ def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Surroundings) -> V
         )
     kind = DIELECTRIC if any(fit.lobe != "paper" for fit in fits) else PAPER
     beckmann = np.array([fit.lobe == BECKMANN_FACETS for fit in fits], np.bool_)
+    surfaces = atlas.lit_scene(atlas.environment(environment))
     if isinstance(environment, Path) and (unknown := unknown_primaries(environment)):
         warn(unknown)
-    surfaces = atlas.lit_scene(atlas.environment(environment))
     lit = replace(surfaces, lobe=kind, beckmann=beckmann)
     diffuse = atlas.map_where_present(_map_or(atlas, "diffuse", "lit"), 3)
     return ViewedAsset(

@@ -134,7 +134,13 @@ def files_below(folder: Path, *, without: Path) -> list[Path]:
     )
 
 
-def seen_of(found: Iterable[Path]) -> list[Path]:
+def seen_of(found: Iterable[Path], *, below: Path | None = None) -> list[Path]:
     """Sorted, without what systems leave beside what people put there: .DS_Store, of each file a
-    ._NAME that ends as that does, and whatever else is hidden."""
-    return sorted(p for p in found if p.name[0] != "." and not any(map(p.match, _LITTER)))
+    ._NAME that ends as that does, and whatever else is hidden; ``below`` a folder, whose own path
+    may be, also what is in hidden folders."""
+
+    def seen(path: Path) -> bool:
+        names = path.relative_to(below).parts if below else (path.name,)
+        return not any(name[0] == "." for name in names) and not any(map(path.match, _LITTER))
+
+    return sorted(filter(seen, found))

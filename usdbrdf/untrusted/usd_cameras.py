@@ -22,6 +22,9 @@ _PLATES = ("houdini:backgroundimage", "usdBrdf:capture:image")
 _MOST_BETWEEN = 10_000  # times of one camera
 # Of a sequence, where its pictures' numbers stand in their names: plate.####.exr, plate.%04d.exr.
 _NUMBER = re.compile(r"#+|%0?(\d?)d")
+# And the number of one of its pictures: plate.0103.exr.
+_OWN_NUMBER = re.compile(r"(?<![0-9])[0-9]{1,9}(?=\.[^.]*$)")
+_ROUNDING = 1e-6  # of times that a layer of another rate scales, and of what is interpolated
 _SHAPE = "verticalAperture"
 _LENS = (
     "focalLength",
@@ -34,7 +37,8 @@ _LENS = (
 
 @dataclass(frozen=True, kw_only=True)
 class UsdCamera:
-    """One camera of a stage at its T time samples; of a camera that does not change, at one.
+    """One camera of a stage at its T time samples; of a camera that does not change, at one, and
+    so of one that stands still before one picture.
 
     path, label        of the prim, and its display name or its own
     times              (T,) time codes; NaN where nothing changes
@@ -98,29 +102,47 @@ def read_here(path: Path) -> tuple[UsdCameras]:
 
 def _camera(camera: UsdGeom.Camera) -> UsdCamera:
     prim = camera.GetPrim()
-    named = map(prim.GetAttribute, _names_of_plates(prim))
-    plate = next((a for a in named if any(map(_is_path, _values(a)))), None)
+    plates = map(prim.GetAttribute, _names_of_plates(prim))
+    plate = next((a for a in plates if any(map(_is_path, _values(a)))), None)
     sampled, between = _times_of(camera, plate)
-    times = sorted({*sampled, *between})
+    known = {*map(_whole, sampled)}
+    times = sorted({*sampled, *(time for time in between if time not in known)})
     codes = [Usd.TimeCode(time) for time in times] or [Usd.TimeCode.EarliestTime()]
     said = [name for name in _LENS if name != _SHAPE or prim.GetAttribute(name).IsAuthored()]
     lens = [
         [_number(prim.GetAttribute(name).Get(code)) if name in said else np.nan for name in _LENS]
         for code in codes
     ]
+    # Row vectors in USD: transposed they are ours.
+    poses = [np.array(camera.ComputeLocalToWorldTransform(code)).T for code in codes]
+    exposure = [camera.ComputeLinearExposureScale(code) for code in codes]
+    files = [_file_of(plate, code) if plate else "" for code in codes]
+    named = next(filter(None, files), "")
+    one = named and {*files} <= {named, ""} and not _is_sequence(named)
+    if one and _is_one(poses) and _is_one(lens) and _is_one(exposure):
+        times, files = [], [named]  # as programs do that write all at every time
+        poses, lens, exposure = poses[:1], lens[:1], exposure[:1]
     return UsdCamera(
         path=str(prim.GetPath()),
         label=prim.GetDisplayName() or prim.GetName(),
-        times=np.array(times or [np.nan], np.float64),
+        times=np.array([*map(_whole, times)] or [np.nan], np.float64),
         sampled=np.array([time in sampled for time in times] or [True], np.bool_),
-        # Row vectors in USD: transposed they are ours.
-        world_from_camera=np.array(
-            [np.array(camera.ComputeLocalToWorldTransform(code)).T for code in codes], np.float64
-        ),
+        world_from_camera=np.array(poses, np.float64),
         lens=np.array(lens, np.float64),
-        exposure=np.array([camera.ComputeLinearExposureScale(code) for code in codes]),
-        images=_images(plate, codes) if plate else ("",) * len(codes),
+        exposure=np.array(exposure, np.float64),
+        images=_images(files, [*map(_whole, times)]) if times else tuple(files),
     )
+
+
+def _whole(time: float) -> float:
+    """The time, but for rounding."""
+    whole = float(round(time)) if math.isfinite(time) else time
+    return whole if abs(time - whole) < _ROUNDING else time
+
+
+def _is_one(rows: Sequence[Any]) -> bool:
+    """Whether what a camera has at several times is one and the same, but for rounding."""
+    return bool(np.allclose(rows, rows[0], _ROUNDING, _ROUNDING, equal_nan=True))
 
 
 def _names_of_plates(prim: Usd.Prim) -> list[str]:
@@ -166,20 +188,22 @@ def _times_between(camera: UsdGeom.Camera, sampled: Sequence[float]) -> Sequence
     return range(math.ceil(sampled[0]), math.floor(sampled[-1]) + 1)
 
 
-def _images(plate: Usd.Attribute, codes: Sequence[Usd.TimeCode]) -> tuple[str, ...]:
-    """The picture of each time."""
-    if codes[0].IsEarliestTime():
-        return (_file_of(plate, codes[0]),)
-    times = [code.GetValue() for code in codes]
-    files = [_file_of(plate, code) for code in codes]
-    if len(times) > 1 and len(set(files)) == 1:
-        # One name for many times may be that of one picture of a sequence, by its number.
-        folder, name = os.path.split(files[0])
-        number = re.search(r"\d+(?=\.[^.]*$)", name)
-        if number and int(number[0]) in times:
-            before, after = name[: number.start()], name[number.end() :]
-            numbers = ["" if t % 1 else f"{int(t)}".zfill(len(number[0])) for t in times]
-            return tuple(n and os.path.join(folder, before + n + after) for n in numbers)
+def _images(files: Sequence[str], times: Sequence[float]) -> tuple[str, ...]:
+    """The picture of each time, of what is named at these: one of a name that lasts where that
+    begins, each of a sequence at its number; "" at other times."""
+    if len(set(files)) > 1:
+        begun = zip(files, ["", *files], times, strict=False)
+        return tuple(
+            _at_time(file, time) if file != before or _is_sequence(file) else ""
+            for file, before, time in begun
+        )
+    # One name for many times may be that of one picture of a sequence, by its number.
+    folder, name = os.path.split(files[0])
+    number = _OWN_NUMBER.search(name)
+    if len(times) > 1 and number and int(number[0]) in times:
+        before, after = name[: number.start()], name[number.end() :]
+        numbers = ["" if t % 1 else f"{int(t)}".zfill(len(number[0])) for t in times]
+        return tuple(n and os.path.join(folder, before + n + after) for n in numbers)
     return tuple(map(_at_time, files, times))
 
 

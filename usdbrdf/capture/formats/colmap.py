@@ -190,7 +190,9 @@ def _workspaces(path: Path) -> list[_Workspace]:
             beside.remove("input")  # what its images were made of
         found += [_Workspace(f, tuple(beside)) for f in folders if model_files(f)]
     # Of any name, if nothing but the model lies there: others may be captures of their own.
-    others = (f for pattern in _MODELS_BELOW for f in seen_of(path.glob(pattern)) if not found)
+    others = (
+        f for pattern in _MODELS_BELOW for f in seen_of(path.glob(pattern), below=path) if not found
+    )
     return found or [_Workspace(f, _IMAGES) for f in others if _holds_a_model_alone(f)]
 
 
@@ -268,7 +270,9 @@ def _of_full_size(counts: dict[str, int]) -> dict[str, int]:
 def _elsewhere(path: Path, workspaces: Sequence[_Workspace], findings: Findings) -> list[_Chosen]:
     """The first model with images, by their very names, in one folder of the capture that is none
     of normals, depths or masks; InputRefused where several hold as many."""
-    below = (p for level in _BELOW for p in seen_of(path.glob(level)) if not p.is_symlink())
+    below = (
+        p for level in _BELOW for p in seen_of(path.glob(level), below=path) if not p.is_symlink()
+    )
     folders = [p.relative_to(path).as_posix() for p in below]
     folders = [folder for folder in folders if not _LAYERS.search(folder)]
     for workspace in workspaces:

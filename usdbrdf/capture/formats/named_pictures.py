@@ -243,7 +243,7 @@ def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
 def _below(folder: Path, *, deep: bool) -> Pictures:
     """Pictures in a folder; links that lead out of it do not count."""
     found = folder.rglob("*") if deep else folder.glob("*")
-    inside = (p for p in seen_of(found) if p.suffix.lower() in SUFFIXES)
+    inside = (p for p in seen_of(found, below=folder) if p.suffix.lower() in SUFFIXES)
     home = folder.resolve()
     paths = (p for p in inside if p.is_file() and p.resolve().is_relative_to(home))
     return Pictures(folder=folder, paths=tuple(sorted(paths)))

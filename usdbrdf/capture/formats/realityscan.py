@@ -82,7 +82,7 @@ def _sidecars(path: Path) -> list[Path]:
     """XMP files of this program in a folder, else in those below it and all below its pictures'."""
     deep = (path / name for name in FOLDERS if name)
     below = chain(path.glob("*/*.xmp"), *(folder.rglob("*.xmp") for folder in deep))
-    found = (sorted({*seen_of(files)}) for files in (path.glob("*.xmp"), below))
+    found = (sorted({*seen_of(files, below=path)}) for files in (path.glob("*.xmp"), below))
     return next((files for files in found if any(map(_is_sidecar, files))), [])
 
 

@@ -73,7 +73,9 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "scene, and download its DSLR assets. [capture.format]"
         )
     found = {camera: pictures_of(folder, options, *_PICTURES[camera]) for camera in there}
-    camera = next((camera for camera in there if found[camera].paths), there[0])
+    # Those of --frames may be any camera's.
+    at_home = [c for c in there if found[c].folder.is_relative_to(folder / c)]
+    camera = next((c for c in (*at_home, *there) if found[c].paths), there[0])
     place, pictures = folder / camera, found[camera]
     if not pictures.paths and camera == "iphone":
         raise InputRefused(

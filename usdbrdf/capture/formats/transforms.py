@@ -152,15 +152,15 @@ def records_of_scene(
     """The frames of a document of a scene of ScanNet++, whose pictures are those in a folder, with
     the axes of the scene's mesh; without masks, which lie in a folder that it does not name."""
     options = replace(options, frames=pictures)
-    _, records = _captured(source, options, findings, in_scene=True)
-    return [replace(record, mask_path=None) for record in records]
+    return _captured(source, options, findings, in_scene=True)[1]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Capture:
     """The document, its path, and what the user said.
 
-    images     whether images and masks are asked for
+    images     whether images are asked for
+    masks      whether masks are
     is_legacy  whether it was made before documents stated what had been done to COLMAP's world
     first_of_camera  of each camera without a stated size the first image, its width and height
     """
@@ -170,6 +170,7 @@ class _Capture:
     options: CaptureOptions
     pictured: Pictured
     images: bool = True
+    masks: bool = True
     is_legacy: bool = False
     first_of_camera: dict[tuple[float | None, ...], tuple[str, int, int]] = field(
         default_factory=dict
@@ -256,6 +257,7 @@ def _captured(
         options=options,
         pictured=Pictured(folder=source.parent, options=options),
         images=images,
+        masks=images and not in_scene,
         is_legacy=has_old_axes(source, document, frames, findings, in_scene=in_scene),
     )
     if any(any(rolling_shutter(frame)) for frame in (document, *frames)):
@@ -424,7 +426,7 @@ def _why_unlike(
 
 def _mask(capture: _Capture, frame: Mapping[str, Any], name: str) -> Path | None:
     mask = frame.get("mask_path")
-    if mask is None or not capture.images:
+    if mask is None or not capture.masks:
         return None
     if not isinstance(mask, str) or not mask.strip():
         said = "is empty" if isinstance(mask, str) else "is not a file name"

@@ -24,6 +24,7 @@ from usdbrdf.capture.reconstructions.shots import (
 )
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
+from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import beginning_of, files_of, number_rows
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -88,14 +89,18 @@ def beside(path: Path) -> list[Path]:
     home = _home(path)
     if home == capture_folder_of(path):
         return []
-    return [*home.glob(_LISTS), *files_of_capture(home, meshes=_MESHES)]
+    return [*_lists(home), *files_of_capture(home, meshes=_MESHES)]
 
 
 def _home(path: Path) -> Path:
     """The capture's folder: that above Bundler's own, where this is named and has not all."""
     folder = capture_folder_of(path)
-    whole = (folder / _UNDISTORTED).is_dir() or any(folder.glob(_LISTS))
+    whole = (folder / _UNDISTORTED).is_dir() or bool(_lists(folder))
     return folder.parent if folder.name == _FOLDER and not whole else folder
+
+
+def _lists(folder: Path) -> list[Path]:
+    return seen_of(folder.glob(_LISTS))
 
 
 def _names(source: Path, folder: Path) -> tuple[str, ...]:
@@ -104,7 +109,7 @@ def _names(source: Path, folder: Path) -> tuple[str, ...]:
     usual = [f"{stem}{mark}list.txt" for mark in (".", "_", "-")]
     named = (*usual, f"{source.name}.list.txt", "list.txt")
     places = [place / name for place in (source.parent, folder) for name in named]
-    found = next((p for p in (*places, *folder.glob(_LISTS)) if p.is_file()), None)
+    found = next((p for p in (*places, *_lists(folder)) if p.is_file()), None)
     if found is None:
         raise InputRefused(
             f"{source}: no {usual[0]} or list.txt beside it, which says of which pictures its "
