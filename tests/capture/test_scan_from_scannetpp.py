@@ -294,14 +294,18 @@ def _alone(folder, room):
     return folder / "transforms.json"
 
 
-def test_a_document_alone_without_test_frames_is_known_by_its_bad_ones(tmp_path, room):
+def test_a_document_that_has_bad_frames_alone_keeps_its_axes(tmp_path, room):
     document = _alone(tmp_path, room)
     said = json.loads(document.read_text())
     said["frames"] += said.pop("test_frames")
     document.write_text(json.dumps(said))
-    scan = read_scan(tmp_path, OPTIONS)
-    assert_same(scan, room)
-    assert any("is_bad, as documents of ScanNet++ have" in one for one in scan.warnings)
+    kept = read_scan(tmp_path, OPTIONS)
+    assert not any("undone" in one for one in kept.warnings)
+    document.write_text(json.dumps(said | {"test_frames": []}))
+    undone = read_scan(tmp_path, OPTIONS)
+    assert any("test_frames, as documents of ScanNet++ have" in one for one in undone.warnings)
+    moved = kept.frames.world_from_camera - undone.frames.world_from_camera
+    assert np.abs(moved).max() > 0.1
 
 
 @pytest.mark.parametrize("old", [True, False])

@@ -368,8 +368,9 @@ def has_old_axes(
     """Whether the poses are in the axes that nerfstudio gave COLMAP's before 2023, and ScanNet++
     those of its scenes, which is told where the document does not say so."""
     beside = (source.parent / _COLMAP).is_dir()
-    sign = TESTED if TESTED in document else BAD if any(BAD in row for row in frames) else ""
-    if "applied_transform" in document or not (beside or sign or in_scene):
+    # Frames that are bad are no sign of ScanNet++: others flag such too.
+    tested = TESTED in document
+    if "applied_transform" in document or not (beside or tested or in_scene):
         return False
     known = _old_axes_by_model(source.parent / _COLMAP, frames) if beside else in_scene or None
     if known is False:
@@ -382,7 +383,7 @@ def has_old_axes(
         )
         doubt = "if they are not"
     else:
-        known_by = "belongs to a scene" if in_scene else f"has {sign}, as documents"
+        known_by = "belongs to a scene" if in_scene else f"has {TESTED}, as documents"
         said = (
             f"{known_by} of ScanNet++{'' if in_scene else ' have'}, so its axes, which are not "
             "those of the scene's mesh, are undone"
