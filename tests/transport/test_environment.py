@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from usdbrdf.asset.layout import Asset
-from usdbrdf.evaluation.evaluate_views import viewed_asset
 from usdbrdf.transport.environment import (
     Environment,
     Sun,
@@ -100,28 +95,6 @@ def test_primaries_that_are_not_known_are_told(tmp_path, known: bool):
     assert output.close()
     said = unknown_primaries(path)
     assert said == "" if known else "sky.exr: the header says that its primaries" in said
-
-
-def test_who_looks_at_an_asset_in_a_light_of_unknown_primaries_is_told(tmp_path, capsys):
-    class Reached(Exception):
-        """The light is asked for."""
-
-    def environment(_: object) -> None:
-        raise Reached
-
-    sky = tmp_path / "sky.exr"
-    spec = oiio.ImageSpec(4, 2, 3, "float")
-    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), (0.6, *[0.3] * 7))
-    output = oiio.ImageOutput.create(str(sky))
-    assert output.open(str(sky), spec)
-    assert output.write_image(np.ones((2, 4, 3), np.float32))
-    assert output.close()
-    scene = SimpleNamespace(objects=[])
-    atlas: Any = SimpleNamespace(scene=scene, environment=environment, lit_scene=None)
-    for asked, told in ((sky, 1), ("none", 0)):
-        with pytest.raises(Reached):
-            viewed_asset(Asset.at(tmp_path), atlas, asked)
-        assert capsys.readouterr().err.count("sky.exr: the header says that its primaries") == told
 
 
 def test_pixels_cover_the_sphere_each_its_part_of_its_zone():

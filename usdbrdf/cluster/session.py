@@ -75,13 +75,11 @@ def _check_place(place: Path | str | None) -> None:
             Path(place).mkdir(parents=True, exist_ok=True)
             if not os.access(place, os.W_OK | os.X_OK):
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-        except (OSError, ValueError) as error:  # the latter of a NUL
-            number = getattr(error, "errno", errno.EINVAL)
-            kind = UsageError if number in _NO_FOLDERS else EnvironmentFailure
+        except OSError as error:
+            kind = UsageError if error.errno in _NO_FOLDERS else EnvironmentFailure
             raise kind(
-                f"--shared-folder {place}: nothing can be written there ({os.strerror(number)}). "
-                "Give a folder that all workers see, under the same name, or a store. "
-                "[cluster.folder]"
+                f"--shared-folder {place}: nothing can be written there ({error.strerror}). Give a "
+                "folder that all workers see, under the same name, or a store. [cluster.folder]"
             ) from error
 
 
