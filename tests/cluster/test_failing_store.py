@@ -48,15 +48,21 @@ class Badly:
         return True
 
 
-@pytest.mark.parametrize("how", ["busy", "cut off", "short", "damaged"])
-def test_what_passes_is_tried_again(
-    server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
-) -> None:
+def _kept(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[str, str]:
+    """Where an array is, and what it is called there."""
     let_us_in(server, monkeypatch)
     address = f"s3://{BUCKET}/{tmp_path.name}"
     ours = Store(files_at(address, tmp_path / "ours"))
     name = ours.keep(ARRAY)
     ours.files.settle()
+    return address, name
+
+
+@pytest.mark.parametrize("how", ["busy", "cut off", "short", "damaged"])
+def test_what_passes_is_tried_again(
+    server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    address, name = _kept(server, tmp_path, monkeypatch)
     badly = Badly(2, how)
     with disturbed(server, badly) as between:
         let_us_in(between, monkeypatch)
@@ -70,11 +76,7 @@ def test_what_passes_is_tried_again(
 def test_what_does_not_pass_is_a_sentence_with_the_address(
     server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    let_us_in(server, monkeypatch)
-    address = f"s3://{BUCKET}/{tmp_path.name}"
-    ours = Store(files_at(address, tmp_path / "ours"))
-    name = ours.keep(ARRAY)
-    ours.files.settle()
+    address, name = _kept(server, tmp_path, monkeypatch)
     badly = Badly(1 << 30, how)
     if how == "busy":  # of which the library is told, and tries for long
         monkeypatch.setattr(object_store, "_LONGEST_READ", 0.0)

@@ -90,10 +90,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         source = _document_of(place, pictures)
         records = records_of_scene(source, pictures.folder, options, findings)
     masks = _masks_of(pictures, folder, camera)
-    mask_of = {r.name: masks / f"{PurePosixPath(r.name).stem}.png" for r in records}
-    records = [
-        replace(r, mask_path=m if (m := mask_of[r.name]).is_file() else None) for r in records
-    ]
+    records = [_with_mask(record, masks) for record in records]
     records.sort(key=lambda record: record.image_path)
     scans = folder / "scans"
     mesh = partial(
@@ -171,6 +168,11 @@ def _masks_of(pictures: Pictures, folder: Path, camera: str) -> Path:
     """The folder of what masks these pictures; of pictures elsewhere, the camera's first."""
     usual = {folder / name: folder / masks for name, masks in _PICTURES[camera].items()}
     return usual.get(pictures.folder, next(iter(usual.values())))
+
+
+def _with_mask(record: FrameRecord, masks: Path) -> FrameRecord:
+    mask = masks / f"{PurePosixPath(record.name).stem}.png"
+    return replace(record, mask_path=mask if mask.is_file() else None)
 
 
 _Through = tuple[Lens, tuple[float, float, float, float], tuple[int, int]]

@@ -144,7 +144,7 @@ def _system(root: Element, block: Element, source: Path) -> str:
     known = {_text(row, "Id"): _text(row, "Definition") for row in root.iter("SRS")}
     stated = {_text(each, "SRSId") for each in (block, *block.iter("Photogroup"))} - {""}
     # One may be listed twice, under an Id of its own of each program that added groups.
-    if len({_parts(known.get(each, "")) if known.get(each) else each for each in stated}) > 1:
+    if len({_parts(known[each]) if known.get(each) else each for each in stated}) > 1:
         raise InputRefused(
             f"{source}: its photographs are in several coordinate systems (SRSId "
             f"{', '.join(sorted(stated))[:40]}). Export the block in one. [capture.unit]"
