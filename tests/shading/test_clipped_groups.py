@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.physics.surfaces import World, quad, room, world_of
+from tests.physics.surfaces import Part, World, quad, room, world_of
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading import clipped_light
 from usdbrdf.shading.clipped_light import clipped_groups
@@ -85,3 +85,60 @@ def test_a_wall_that_clips_where_it_is_brightest_is_no_lamp(world: World, own):
     lit[wall] = np.minimum(bright, BOUND)[..., None]
     found = _groups(world, lit, clipped)
     np.testing.assert_array_equal(found.lamp, [False])
+
+
+def test_what_nobody_saw_beside_a_lamp_in_a_wall_is_part_of_it(world: World, own):
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
+    wall = own(WALL).reshape(32, 32)
+    lamp, beside = wall[8:16, 8:16].ravel(), wall[4:20, 16:20]
+    lit[lamp] = BOUND
+    # Not what lies beside what was seen of the wall.
+    far = wall[26:30, 8:16].ravel()
+    found = _groups(world, lit, lamp, unseen=[*beside.ravel(), *far])
+    assert found.lamp.all()
+    # Of these four columns two lie nearer to the wall behind them.
+    assert (found.group[[*lamp, *beside[6:-6, :2].ravel()]] == 0).all()
+    assert (found.group[beside[:, 2:]] == -1).all()
+    assert (found.group[beside[[0, -1]]] == -1).all()
+    assert set(np.flatnonzero(found.group == 0)) <= {*lamp, *beside.ravel()}
+
+
+def test_a_lamp_reaches_no_farther_into_what_nobody_saw_than_it_is_wide(world: World, own):
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
+    wall = own(WALL).reshape(32, 32)
+    lamp, unseen = wall[12:20, :8].ravel(), wall[:, 8:].ravel()
+    lit[lamp] = BOUND
+    found = np.flatnonzero(_groups(world, lit, lamp, unseen=unseen).group == 0)
+    place = world.texels.position
+    away = np.linalg.norm(place[found][:, None] - place[lamp], axis=2).min(axis=1)
+    radius = np.sqrt(world.texels.area[lamp].sum() / np.pi)
+    assert 0.8 * radius < away.max() < radius
+
+
+def _two_faced(front: Part, back: Part) -> Part:
+    """Both in one object, beside each other in its atlas."""
+    left, right = front.uv * (0.5, 1), back.uv * (0.5, 1) + (0.5, 0)
+    return Part(
+        points=np.concatenate([front.points, back.points]),
+        triangles=np.concatenate([front.triangles, back.triangles + len(front.points)]),
+        uv=np.concatenate([left, right]),
+        normals=np.concatenate([front.normals, back.normals]),
+        size=(2 * front.size[0], front.size[1]),
+    )
+
+
+def test_the_back_of_a_lamp_that_is_seen_in_part_is_none():
+    """One sheet of metal, its back black and seen, the lamp on its front seen but for a strip."""
+    front = quad((1.5, 1, 2.4), (0, 1, 0), (1, 0, 0), size=(16, 16))
+    back = quad((1.5, 1, 2.401), (1, 0, 0), (0, 1, 0), size=(16, 16))
+    world = world_of([*room((0, 0, 0), (4, 3, 2.5)), _two_faced(front, back)])
+    own = np.arange(*world.texels.of_object(LAMP).indices(len(world.texels)))
+    down = world.texels.geometric_normal[own, 2] < 0
+    assert 0 < down.sum() < len(own)
+    strip = down & (world.texels.position[own, 0] > 2.3)
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
+    lamp = own[down & ~strip]
+    lit[lamp] = BOUND
+    found = _groups(world, lit, lamp, unseen=own[strip])
+    assert found.lamp.all()
+    np.testing.assert_array_equal(np.flatnonzero(found.group == 0), own[down])

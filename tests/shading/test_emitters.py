@@ -123,6 +123,21 @@ def test_a_clipped_lamp_is_a_lower_bound(world: World, lit: np.ndarray):
     assert not _find(world, lit, seen=~few, clipped=few).lower_bound.any()
 
 
+def test_the_dark_measured_half_of_a_lamp_says_nothing_of_how_bright_it_is(
+    world: World, lit: np.ndarray
+):
+    """As a sheet of metal that is lit from behind a pane on one side, all of it clipped there."""
+    own = np.flatnonzero(world.texels.object_index() == LAMP)
+    dark, bright = own[: len(own) * 2 // 5], own[len(own) * 2 // 5 :]
+    lit[dark] = 1e-3
+    clipped = np.zeros(len(lit), bool)
+    clipped[bright] = True
+    found = _find(world, lit, seen=~clipped, clipped=clipped)
+    assert found.is_lamp[LAMP]
+    assert found.lower_bound[LAMP]
+    np.testing.assert_allclose(found.radiance[LAMP], [8, 7, 6], rtol=1e-6)
+
+
 def test_no_wall_shines_while_a_lamp_is_too_dark(world: World, lit: np.ndarray):
     # The lamp is known as 8 at least and is brighter: S is half of what it should be, and a wall of
     # albedo 0.75 looks like 1.5.

@@ -106,13 +106,14 @@ def clipped_groups(
     said: Mapping[int, bool] = MappingProxyType({}),
 ) -> ClippedGroups:
     """An object more than half of whose observed area clipped is one group, with what nobody saw
-    of it; on others each connected part is one.
+    of it; on others each connected part is one, if it looks like a lamp with what nobody saw beside
+    it.
 
     radiance (T, 3): L_d, a lower bound where ``coverage`` says clipped
     said     of objects whether they are lamps, where that is known
     """
     found: list[tuple[float, int, float, bool, Long]] = []
-    measured, clipped = coverage.measured, coverage.clipped
+    measured, clipped, unseen = coverage.measured, coverage.clipped, ~coverage.observed
     bright = radiance.max(axis=1)
     reach = _AROUND * float(np.sqrt(texels.area.sum()))
     for i in range(len(texels.resolution)):
@@ -130,6 +131,8 @@ def clipped_groups(
                 near = bright[around[distance < reach]]
                 lamp = not len(near) or float(np.median(near)) < _NEARLY * bound
             lamp = said.get(i, lamp)
+            if lamp and not whole:
+                part = _with_unseen(texels, part, own[coverage.observed[own]], own[unseen[own]])
             found.append((bound * float(texels.area[part].sum()), i, bound, lamp, part))
     wall = np.zeros(len(texels), np.bool_)
     for *_, lamp, part in found:
@@ -159,6 +162,22 @@ def _connected(texels: Texels, candidates: Long) -> list[Long]:
     return [part for part in parts if len(part) >= _MIN_TEXELS]
 
 
+def _with_unseen(texels: Texels, part: Long, observed: Long, unseen: Long) -> Long:
+    """A lamp's texels, with those that no frame shows to which they are the nearest observed ones:
+    in units of the lamp's own radius, or of how far a normal turns by 60 degrees, and by no more
+    than one. A lamp that is seen in part would otherwise be as much too bright as it is too small.
+    """
+    radius = np.sqrt(texels.area[part].sum() / np.pi)
+
+    def place(index: Long) -> Float:
+        return np.hstack([texels.position[index] / radius, texels.geometric_normal[index]])
+
+    distance, nearest = cKDTree(place(observed)).query(place(unseen), distance_upper_bound=1.0)
+    near = np.isfinite(distance)
+    near[near] = np.isin(observed[nearest[near]], part)
+    return np.sort(np.concatenate([part, unseen[near]]))
+
+
 @dataclass(frozen=True, kw_only=True)
 class ClippedLight:
     """L_d with the estimates in it, and what they are.
@@ -172,8 +191,10 @@ class ClippedLight:
     estimate: EstimatedRadiance
 
     def may_shine(self, clipped: Bool) -> Bool:
-        """(T,): the clipped texels but those that are clearly part of a bright wall."""
-        return np.asarray(clipped & ~self.groups.wall, np.bool_)
+        """(T,): the clipped texels, and what nobody saw of lamps, but those that are clearly part
+        of a bright wall."""
+        lamps = self.groups.texels_of(self.groups.lamp)
+        return np.asarray((clipped | lamps) & ~self.groups.wall, np.bool_)
 
     def error_of_object(self, index: int) -> float:
         """Relative standard error of the object's estimate; NaN if it has none."""

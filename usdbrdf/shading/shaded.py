@@ -44,9 +44,9 @@ _LAMP_ROUNDS = 3
 @dataclass(frozen=True, kw_only=True)
 class Emitters:
     """emissive (T,) bool per texel; is_lamp (num_objects,) bool: the object shines as a whole;
-    radiance (num_objects, 3) float32: area-weighted mean of its emissive, seen texels (0 where
-    there are none); lower_bound (num_objects,) bool: less than a tenth of that area was ever seen
-    unsaturated, so the radiance can only be larger."""
+    radiance (num_objects, 3) float32: area-weighted mean of its emissive, seen texels that are
+    brighter than what they reflect (0 where there are none); lower_bound (num_objects,) bool:
+    less than a tenth of that area was ever seen unsaturated, so the radiance can only be larger."""
 
     emissive: Bool
     is_lamp: Bool
@@ -103,7 +103,8 @@ def find_emitters(
             is_lamp[i], lower_bound[i], emissive[own] = True, True, True
             mean[i] = radiance[own].mean(axis=0)
             continue
-        weight = area * emissive[own]
+        glows = emissive[own] & shines[own]
+        weight = area * (glows if glows.any() else emissive[own])
         exact = weight * seen[own]
         # Some of a lamp is often seen in long exposures alone; what the short one shows counts.
         lower_bound[i] = exact.sum() < 0.1 * weight.sum()
