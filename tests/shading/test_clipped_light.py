@@ -129,3 +129,21 @@ def test_an_undetermined_lamp_stands_below_its_estimate_or_at_what_was_measured(
     expected = lit.copy()
     expected[2:4] = 4 * 60 * np.exp(-1.8)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_what_nobody_saw_of_a_lamp_shines_only_if_the_lamp_is_determined():
+    groups = ClippedGroups(
+        group=np.array([-1, 0, 0, 1, 1], np.int32),
+        object=np.arange(2, dtype=np.int32),
+        bound=np.full(2, 4.0, np.float32),
+        lamp=np.ones(2, np.bool_),
+        wall=np.zeros(5, np.bool_),
+    )
+    estimate = EstimatedRadiance(
+        multiplier=np.full((2, 3), 9.0),
+        standard_error=np.array([[0.1] * 3, [0.9] * 3]),
+        determined=np.array([True, False]),
+    )
+    light = ClippedLight(lit=np.ones((5, 3), np.float32), groups=groups, estimate=estimate)
+    clipped = np.array([False, True, False, True, False])
+    np.testing.assert_array_equal(light.may_shine(clipped), [False, True, True, True, False])

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from usdbrdf.shading.shaded import Shaded
+from usdbrdf.shading.shaded import Shaded, _doubt
 
 
 def _shaded(*, emits=False, outside=None, error=0.01, over_one=0.0, escaped=0.0) -> Shaded:
@@ -62,3 +62,29 @@ def test_an_open_scan_whose_surroundings_are_given_is_no_doubt(estimated):
     doubts = list(_shaded(outside=outside, escaped=0.9).doubts(["box"]))
     assert len(doubts) == estimated
     assert all("--environment to measure it" in doubt for doubt in doubts)
+
+
+def test_light_is_doubted_as_the_lamps_that_bring_most_of_it():
+    """Two lamps that clip, the second undetermined, and one that no frame shows."""
+    texels = SimpleNamespace(
+        area=np.full(8, 0.5, np.float32), object_index=lambda: np.repeat(np.arange(4), 2)
+    )
+    clipped = SimpleNamespace(
+        lit=np.repeat(np.float32([[1, 1, 1], [3, 3, 3], [9, 9, 9], [1, 1, 1]]), 2, axis=0),
+        groups=SimpleNamespace(
+            group=np.array([-1, -1, 0, 0, 1, 1, -1, -1]), lamp=np.ones(2, np.bool_)
+        ),
+        estimate=SimpleNamespace(
+            determined=np.array([True, False]), standard_error=np.array([[0.1, 0.2, 0.1], [9] * 3])
+        ),
+    )
+    none = SimpleNamespace(object=np.zeros(0, np.int32), error=np.zeros(0, np.float32))
+    unseen = SimpleNamespace(object=np.array([3], np.int32), error=np.array([0.4], np.float32))
+    outside = SimpleNamespace(doubt=0.15)
+    assert _doubt(texels, clipped, none, None) == pytest.approx(0.2)
+    assert _doubt(texels, clipped, none, outside) == pytest.approx(0.25)
+    # The one weighs three times as much as the other.
+    both = np.hypot(0.75 * 0.2, 0.25 * 0.4)
+    assert _doubt(texels, clipped, unseen, None) == pytest.approx(both)
+    clipped.estimate.determined[:] = False
+    assert _doubt(texels, clipped, none, None) == 0

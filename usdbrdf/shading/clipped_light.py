@@ -191,9 +191,9 @@ class ClippedLight:
     estimate: EstimatedRadiance
 
     def may_shine(self, clipped: Bool) -> Bool:
-        """(T,): the clipped texels, and what nobody saw of lamps, but those that are clearly part
-        of a bright wall."""
-        lamps = self.groups.texels_of(self.groups.lamp)
+        """(T,): the clipped texels, and what nobody saw of lamps that are determined, but those
+        that are clearly part of a bright wall."""
+        lamps = self.groups.texels_of(self.groups.lamp & self.estimate.determined)
         return np.asarray((clipped | lamps) & ~self.groups.wall, np.bool_)
 
     def error_of_object(self, index: int) -> float:

@@ -398,6 +398,24 @@ def _lit_by_unseen_lamps(
     return lit, unseen
 
 
+def _doubt(
+    texels: Texels, light: ClippedLight, unseen: UnseenLamps, outside: Outside | None
+) -> float:
+    """Relative standard error of S by what lights the scan and is inferred: the lamps that clip or
+    that no frame shows, weighed by their power, and what is outside."""
+    lamps = np.flatnonzero(light.groups.lamp & light.estimate.determined)
+    known = (
+        (float(light.estimate.standard_error[k].max()), light.groups.group == k) for k in lamps
+    )
+    guessed = zip(unseen.error.tolist(), unseen.object.tolist(), strict=True)
+    known_unseen = ((error, texels.object_index() == number) for error, number in guessed)
+    power, doubt = 0.0, 0.0
+    for error, own in (*known, *known_unseen):
+        one = float(texels.area[own] @ light.lit[own].mean(axis=1))
+        power, doubt = power + one, math.hypot(doubt, error * one)
+    return math.hypot(doubt / max(power, 1e-30), outside.doubt if outside else 0.0)
+
+
 def shade_surface(
     run: TaskRun,
     surface: TexturedScene,
@@ -425,7 +443,7 @@ def shade_surface(
     irradiance = denoised_irradiance(surface.texels, traced.mean) if filtered else traced.mean
     texels, seen = surface.texels, coverage.measured
     may_shine = light.may_shine(coverage.clipped)
-    doubt = outside.doubt if outside else 0.0
+    doubt = _doubt(texels, light, unseen, outside)
     dimmest = light.least_of_lamps(clear_of(doubt) / np.pi * irradiance.max(axis=1))
     emitters = find_emitters(
         texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt
