@@ -10,7 +10,7 @@ import pytest
 
 from tests.page.conftest import data_of
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.review import read_review
+from usdbrdf.asset.review import Judgement, changes_since, read_review, write_review
 from usdbrdf.page.report import page, reviewed
 from usdbrdf.page.server import PageServer
 
@@ -228,27 +228,72 @@ def test_a_verdict_of_a_file_is_handed_over_as_a_layer(opened, page_file, room, 
     assert (said.status, said.phi) == (row["fit"], pytest.approx(row["phi"]))
 
 
-def test_a_verdict_of_a_served_page_is_saved_and_comes_back(opened, page_file, room, tmp_path):
+def test_verdicts_that_a_page_only_repeats_stay_of_what_was_judged(
+    opened, page_file, room, tmp_path
+):
     folder = tmp_path / "room"
     shutil.copytree(room.asset, folder)
     asset, data = Asset.made(folder), data_of(page_file.read_text("utf-8"))
-    label = data["objects"][0]["label"]
+    first, second = data["objects"][:2]
+    write_review(
+        asset, {first["prim"]: Judgement(verdict="reject", status="prior", phi=0.11, psi=0.22)}
+    )
+    (tmp_path / "again.html").write_text(page({**data, **reviewed(asset)}), "utf-8")
+    shown = opened((tmp_path / "again.html").as_uri())
+    judge(shown, second["label"], "good")
+    shown.get_by_role("button", name=first["label"], exact=True).click()
+    group = shown.get_by_role("group", name=f"Your verdict on {first['label']}")
+    group.get_by_label("accept").check()
+    group.get_by_label("reject").check()
+    with shown.expect_download() as download:
+        shown.get_by_role("button", name="Save verdicts").click()
+    download.value.save_as(folder / "review.usda")
+    found = read_review(asset)
+    assert (found[first["prim"]].status, found[first["prim"]].phi) == ("prior", 0.11)
+    assert found[second["prim"]].status == second["fit"]
+    assert first["prim"] in changes_since(asset)
+
+
+@pytest.fixture
+def served(room, page_file, tmp_path):
+    """A copy of the room's asset, what its page carries, and the address that serves it."""
+    folder = tmp_path / "room"
+    shutil.copytree(room.asset, folder)
+    asset, data = Asset.made(folder), data_of(page_file.read_text("utf-8"))
     server = PageServer(asset, lambda at: page({**data, **reviewed(asset)}, served=at))
     thread = threading.Thread(target=server.serve)
     thread.start()
-    try:
-        shown = opened(server.address)
-        judge(shown, label, "good")
-        shown.get_by_role("button", name="Save verdicts").click()
-        shown.get_by_text("saved in review.usda").wait_for()
-        assert shown.faults == []
-        again = opened(server.address)
-        again.locator("#filter-verdict").select_option("accept")
-        assert again.locator("#count").inner_text() == f"1 of {len(data['objects'])} objects"
-    finally:
-        server.close()
-        thread.join()
+    yield asset, data, server.address
+    server.close()
+    thread.join()
+
+
+def test_a_verdict_of_a_served_page_is_saved_and_comes_back(opened, served):
+    asset, data, address = served
+    label = data["objects"][0]["label"]
+    shown = opened(address)
+    judge(shown, label, "good")
+    shown.get_by_role("button", name="Save verdicts").click()
+    shown.get_by_text("saved in review.usda").wait_for()
+    assert shown.faults == []
+    again = opened(address)
+    again.locator("#filter-verdict").select_option("accept")
+    assert again.locator("#count").inner_text() == f"1 of {len(data['objects'])} objects"
     assert read_review(asset)[data["objects"][0]["prim"]].comment == "good"
+
+
+def test_a_page_that_was_opened_before_takes_nothing_back_that_others_said(opened, served):
+    asset, data, address = served
+    first, second = data["objects"][:2]
+    write_review(asset, {first["prim"]: Judgement(verdict="accept", status="prior")})
+    shown = opened(address)
+    write_review(asset, {first["prim"]: Judgement(verdict="reject", status="prior")})
+    judge(shown, second["label"], "good")
+    shown.get_by_role("button", name="Save verdicts").click()
+    shown.get_by_text("saved in review.usda").wait_for()
+    found = read_review(asset)
+    assert found[first["prim"]].verdict == "reject"
+    assert found[second["prim"]].verdict == "accept"
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1440, "light"), (390, "dark")])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from usdbrdf.asset.review import changes_since, read_review
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
+from usdbrdf.evaluation.metrics import finite
 from usdbrdf.files.atomic import environment_failures, write_text_atomic
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reading
@@ -186,11 +187,13 @@ def _refuse_without_photographs(asset: Asset, frames: Frames) -> None:
 
 
 def reviewed(asset: Asset) -> dict[str, Any]:
-    """What people said of the objects by now, and what changed since."""
-    said = read_review(asset)
-    words = ("verdict", "comment", "directive")
+    """What people said of the objects by now, of which numbers, and what changed since."""
+    said = {path: asdict(one) for path, one in read_review(asset).items()}
     return {
-        "review": {path: {w: getattr(one, w) for w in words} for path, one in said.items()},
+        "review": {
+            path: {**one, "phi": finite(one["phi"]), "psi": finite(one["psi"])}
+            for path, one in said.items()
+        },
         "changed": changes_since(asset),
     }
 

@@ -165,6 +165,8 @@
   const review = new Map(Object.entries(data.review || {}));
   const changed = data.changed || {};
   let unsaved = false;
+  // What was said on this page since it last saved: others may have said more of the rest by now.
+  const said = new Map();
   const judged = (prim) => review.get(prim) || { verdict: '', comment: '', directive: '' };
   const encoded = (linear) => {
     const value = Math.min(Math.max(linear, 0), 1);
@@ -389,7 +391,12 @@
       el('label', {}, el('input', { type: 'radio', name, value, checked: value === now.verdict, onchange: note }), ` ${text}`));
     function note() {
       const chosen = form.querySelector('input:checked').value;
-      review.set(one.prim, { verdict: chosen, comment: comment.value.trim(), directive: directive.value });
+      const words = { verdict: chosen, comment: comment.value.trim(), directive: directive.value };
+      const first = (data.review || {})[one.prim];
+      // Said again as it was, it was judged then, of what was there then.
+      const same = first && Object.keys(words).every((word) => words[word] === first[word]);
+      review.set(one.prim, same ? first : words);
+      said.set(one.prim, words);
       unsaved = true;
       $('saved').textContent = 'not saved yet';
       showVerdict(entry);
@@ -409,11 +416,12 @@
   function layer() {
     const tree = {};
     for (const one of data.objects) {
-      const { verdict, comment, directive } = judged(one.prim);
+      const now = judged(one.prim), { verdict, comment, directive } = now;
       if (!(verdict || comment || directive)) continue;
+      const { status, phi, psi } = 'status' in now ? now : { ...one, status: one.fit };
       let node = tree;
       for (const part of one.prim.split('/').filter(Boolean)) node = (node[part] ??= {});
-      node[''] = { verdict, comment, directive, status: one.fit, phi: one.phi, psi: one.psi };
+      node[''] = { verdict, comment, directive, status, phi, psi };
     }
     const write = (node, indent) => Object.entries(node).filter(([name]) => name).map(([name, inner]) => {
       const said = inner[''], pad = ' '.repeat(indent);
@@ -433,15 +441,19 @@
 
   async function save() {
     if (data.served) {
+      const sent = [...said];
       const answer = await fetch(data.served, {
         method: 'POST', headers: { 'Content-Type': 'application/json' },
-        body: JSON.stringify(Object.fromEntries(review)),
+        body: JSON.stringify(Object.fromEntries(sent)),
       }).catch(() => null);
       if (!answer || !answer.ok) {
         $('saved').textContent = answer ? `not saved: ${await answer.text()}` : 'not saved: usdbrdf view has ended';
         return;
       }
       $('saved').textContent = 'saved in review.usda';
+      for (const [prim, words] of sent) if (said.get(prim) === words) said.delete(prim);
+      unsaved = said.size > 0;
+      return;
     } else {
       const link = el('a', {
         href: URL.createObjectURL(new Blob([layer()], { type: 'text/plain' })), download: 'review.usda',
