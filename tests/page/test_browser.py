@@ -111,6 +111,19 @@ def test_no_error_reads_as_none_and_what_shines_is_not_said_to_lack_pixels(
     assert "What shines by itself is not fitted." in detail.inner_text()
 
 
+def test_every_column_and_number_of_the_trade_is_explained(opened, page_file):
+    shown = opened(page_file.as_uri())
+    headings = shown.locator("#table thead th").all_inner_texts()
+    shown.get_by_text("What the columns mean").click()
+    told = shown.locator("#words dt").all_inner_texts()
+    assert set(headings) - set(told) == {"Picture", "Object", "Verdict"}
+    shown.get_by_text("What these words mean").click()
+    for word in ("FLIP", "Relative L2", "Diffuse baseline", "Full model"):
+        assert shown.locator("#slider dt", has_text=word).is_visible()
+    compared = shown.locator("#slider p").inner_text()
+    assert re.search(r"[0-9]\.[0-9] % of the pixels are compared\.$", compared)
+
+
 def test_the_slider_moves_over_the_views(opened, page_file):
     shown = opened(page_file.as_uri())
     slider, compared = shown.locator("#at"), shown.locator(".compare")
@@ -348,7 +361,8 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     data = data_of(page_file.read_text("utf-8"))
     metal, guess, *_ = (row for row in data["objects"] if row["status"] != "lamp")
     metal.update(f0=[0.9, 0.6, 0.3], psi=1.0, psi_confidence="high")
-    guess.update(f0=None, psi=0.25, psi_error=0.5, phi_confidence="none", psi_confidence="none")
+    unsure = {"f0": None, "phi_confidence": "none", "psi_confidence": "none"}
+    guess.update(unsure, psi=0.0, psi_error=0.29, psi_upper=0.96)
     data["warnings"] = [f"number {i} is wrong" for i in range(12)]
     (tmp_path / "metal.html").write_text(page(data), "utf-8")
     shown = opened((tmp_path / "metal.html").as_uri())
@@ -358,7 +372,7 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     }
     assert cells[metal["prim"]].nth(1).inner_text() == "metal"
     assert "F0 high" in shown.locator(f'tr[data-prim="{metal["prim"]}"]').inner_text()
-    assert cells[guess["prim"]].nth(1).inner_text() == "0.25 \u00b1 0.50"
+    assert cells[guess["prim"]].nth(1).inner_text() == "0.00, below 0.96"
     colour = "x => getComputedStyle(x).color"
     assert cells[guess["prim"]].nth(1).evaluate(colour) == shown.locator("#lead").evaluate(colour)
     assert shown.locator("#warnings .warning:visible").count() == 8
