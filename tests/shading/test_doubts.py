@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -62,3 +63,18 @@ def test_an_open_scan_whose_surroundings_are_given_is_no_doubt(estimated):
     doubts = list(_shaded(outside=outside, escaped=0.9).doubts(["box"]))
     assert len(doubts) == estimated
     assert all("--environment to measure it" in doubt for doubt in doubts)
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+def test_a_lamp_that_no_frame_shows_wants_a_photograph_and_no_shorter_exposure(hidden):
+    found = replace(
+        _shaded(emits=True),
+        unseen=SimpleNamespace(object=[0] if hidden else [], error_of=lambda _: 0.07),
+        emitters=SimpleNamespace(
+            emissive=np.ones(4, np.bool_), lower_bound=[True], radiance=np.ones((1, 3))
+        ),
+    )
+    (doubt,) = found.doubts(["bulb"])
+    wanted = "Photograph it to measure it." if hidden else "Capture a shorter exposure to measure"
+    assert wanted in doubt
+    assert ("exposure" in doubt) != hidden

@@ -6,7 +6,7 @@ The page is data (JSON) and the parts of ``static``; nothing is loaded when it i
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -118,10 +118,14 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     fits = [_in_own_frames(atlas, obj.prim_path) for obj in atlas.scene.objects]
     known = [fit for fit in fits if fit is not None]
     words = [status_of(atlas, i, fit) for i, fit in enumerate(fits)]
-    reasons = [undetermined_because(fit, word) for fit, word in zip(fits, words, strict=True)]
     frames, found, advice = atlas.frames, summaries(place), read_advice(place)
     chosen = _frames_to_search(len(frames), known)
     where = objects_in_frames(seen.lit.rays, atlas.scene.face_object, len(words), frames.at(chosen))
+    reasons = [
+        undetermined_because(fit, word, in_sight=bool(where.in_sight[i]))
+        for i, (fit, word) in enumerate(zip(fits, words, strict=True))
+    ]
+    lamps = [o.identifier for o, w in zip(atlas.scene.objects, words, strict=True) if w == "lamp"]
     widest = chosen[shows_most(where.share)]
     pictures = options.photographs
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
@@ -146,7 +150,17 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
             "triangles": len(atlas.scene.triangles),
             "texels": len(atlas.texels),
         },
-        "findings": findings(found, reasons, bool(frames.radiometric)),
+        "findings": findings(
+            found,
+            reasons,
+            bool(frames.radiometric),
+            _with_texels(atlas, lambda own: not atlas.coverage.observed[own].any()),
+            [
+                name
+                for name in _with_texels(atlas, lambda own: bool(atlas.emissive[own].any()))
+                if name not in lamps
+            ],
+        ),
         "warnings": [
             sentence
             for sentence in warnings_of(found)
@@ -196,6 +210,15 @@ def reviewed(asset: Asset) -> dict[str, Any]:
         },
         "changed": changes_since(asset),
     }
+
+
+def _with_texels(atlas: AssetMaps, holds: Callable[[slice], bool]) -> list[str]:
+    """Identifiers of objects of whose texels something holds."""
+    return [
+        obj.identifier
+        for i, obj in enumerate(atlas.scene.objects)
+        if holds(atlas.texels.of_object(i))
+    ]
 
 
 def _in_own_frames(atlas: AssetMaps, prim_path: str) -> FittedObject | None:

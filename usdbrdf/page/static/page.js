@@ -194,7 +194,7 @@
 
   /* What the words of the trade say, for who judges without them. */
   const WORDS = {
-    Status: 'measured: the photographs determine roughness and specular. Not determined: no photograph shows a clear enough highlight, and the grey numbers are what remains likely. Unseen: no photograph shows the object.',
+    Status: 'measured: the photographs determine roughness and specular. Not determined: no photograph shows a clear enough highlight, and the grey numbers are what remains likely. Unseen: no photograph shows enough of the object to measure anything.',
     Colour: 'the mean of the base colour: what the object reflects to all sides, without highlights and without the light that fell on it.',
     'Roughness \u03c6': 'how wide highlights are: 0 a mirror, 1 matt (alpha of the GGX distribution; the roughness of most renderers is its square root). \u00b1: one standard deviation.',
     'Specular \u03c8': 'how strong they are: 0.5 is usual for wood, paint and plastics, 0 has none (what is mirrored straight ahead is 0.08 \u03c8 of the light). Of metals a colour, F0, takes its place.',
