@@ -381,6 +381,17 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     assert shown.faults == []
 
 
+@pytest.mark.parametrize(
+    ("warnings", "told"), [([], "No warnings."), (None, "What was warned of is not known here")]
+)
+def test_no_warning_is_told_apart_from_none_known(opened, page_file, tmp_path, warnings, told):
+    data = {**data_of(page_file.read_text("utf-8")), "warnings": warnings, "room": None}
+    (tmp_path / "quiet.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "quiet.html").as_uri())
+    assert shown.locator("#warnings").inner_text().startswith(told)
+    assert shown.faults == []
+
+
 def test_a_table_of_hundreds_leaves_the_rest_of_the_page_within_reach(opened, page_file, tmp_path):
     data = data_of(page_file.read_text("utf-8"))
     kinds = data["objects"]

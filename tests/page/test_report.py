@@ -23,7 +23,7 @@ from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView, measured_atlas, viewed_asset
 from usdbrdf.model.material import turned_up
 from usdbrdf.page import objects, views
-from usdbrdf.page.capture import findings
+from usdbrdf.page.capture import findings, warnings_of
 from usdbrdf.page.daylight import _around, daylight
 from usdbrdf.page.objects import undetermined_because, why
 from usdbrdf.page.pictures import (
@@ -312,6 +312,14 @@ def test_the_counts_of_all_objects_are_told_and_hundreds_of_lamps_in_one_sentenc
     assert parts[1:] == ["1 is a lamp.", "A part of table, shelf shines, too."]
     (one,) = (line for line in findings({"texture": {}, "shade": {}}, ["failed"], True)[1:])
     assert one == "The fit of 1 failed: its photographs do not determine the numbers."
+
+
+def test_where_no_step_left_its_record_warnings_are_not_said_to_be_none():
+    steps = ("ingest", "texture", "shade", "fit")
+    nothing = {step: {} for step in steps}
+    assert warnings_of(nothing) is None
+    assert warnings_of({**nothing, "fit": {"objects": {}}}) == []
+    assert warnings_of({**nothing, "shade": {"warnings": ["dark"]}}) == ["dark"]
 
 
 def test_nothing_that_a_photograph_shows_is_said_to_be_in_none():

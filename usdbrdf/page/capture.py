@@ -40,8 +40,11 @@ def summaries(asset: Asset) -> dict[str, dict[str, Any]]:
     return found
 
 
-def warnings_of(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """All sentences of warning, in the order of the steps."""
+def warnings_of(found: Mapping[str, Mapping[str, Any]]) -> list[str] | None:
+    """All sentences of warning, in the order of the steps; None where no step's stamp is there: a
+    published version does not hold what they told."""
+    if not any(found[step] for step in STEPS):
+        return None
     return [str(sentence) for step in STEPS for sentence in found[step].get("warnings", ())]
 
 

@@ -161,11 +161,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
                 if name not in lamps
             ],
         ),
-        "warnings": [
-            sentence
-            for sentence in warnings_of(found)
-            if pictures or not any(path.name in sentence for path in frames.image_paths)
-        ],
+        "warnings": _tellable(warnings_of(found), frames, pictures),
         "rows": [unnamed(row, pictures) for row in frame_rows(frames)],
         "map": room_map(
             atlas,
@@ -210,6 +206,13 @@ def reviewed(asset: Asset) -> dict[str, Any]:
         },
         "changed": changes_since(asset),
     }
+
+
+def _tellable(warnings: list[str] | None, frames: Frames, photographs: bool) -> list[str] | None:
+    """Without those that name a photograph, unless these may be shown."""
+    if warnings is None or photographs:
+        return warnings
+    return [w for w in warnings if not any(path.name in w for path in frames.image_paths)]
 
 
 def _with_texels(atlas: AssetMaps, holds: Callable[[slice], bool]) -> list[str]:

@@ -38,14 +38,17 @@
     const measured = data.objects.filter((one) => one.status === 'measured').length;
     $('lead').textContent = `${facts.frames} photographs, ${data.objects.length} objects, ${measured} measured`;
     $('findings').append(...data.findings.map((sentence) => el('li', {}, sentence)));
-    const warned = data.warnings.map((sentence) =>
+    const warned = (data.warnings || []).map((sentence) =>
       el('p', { class: 'warning' }, el('strong', {}, 'Warning: '), sentence));
     const first = warned.length > MOST_WARNINGS + 1 ? MOST_WARNINGS : warned.length;
     $('warnings').append(...warned.slice(0, first));
     if (first < warned.length) {
       $('warnings').append(el('details', {}, el('summary', {}, `${warned.length - first} more warnings`), ...warned.slice(first)));
     }
-    if (!data.warnings.length) $('warnings').append(el('p', { class: 'soft' }, 'No warnings.'));
+    if (!warned.length) {
+      $('warnings').append(el('p', { class: 'soft' }, data.warnings ? 'No warnings.'
+        : 'What was warned of is not known here: a published version does not hold it. The page of the asset tells.'));
+    }
     const told = [
       ...(facts.lighting ? [['Lighting', facts.lighting]] : []),
       ['Photographs', `${facts.frames}, ${facts.resolution.join(' \u00d7 ')} pixels, ${facts.encoding}`],
