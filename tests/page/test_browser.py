@@ -11,7 +11,9 @@ import pytest
 from tests.page.conftest import data_of
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.review import Judgement, changes_since, read_review, write_review
-from usdbrdf.page.report import page, reviewed
+from usdbrdf.delivery.publish import publish
+from usdbrdf.options import PublishOptions
+from usdbrdf.page.report import page, report, reviewed
 from usdbrdf.page.server import PageServer
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs usdbrdf[browser]")
@@ -379,6 +381,19 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     shown.get_by_text("4 more warnings").click()
     assert shown.locator("#warnings .warning:visible").count() == 12
     assert shown.faults == []
+
+
+def test_the_page_of_a_version_says_which_it_is(opened, page_file, room, tmp_path):
+    asset = Asset.made(room.asset)
+    assert data_of(page_file.read_text("utf-8"))["published"] == ""
+    for name in ("v001", "v002"):
+        publish(
+            asset.folder, tmp_path / "dest", PublishOptions(version=name, uri=f"studio://{name}")
+        )
+    report(tmp_path / "dest" / "v002", tmp_path / "second.html")
+    shown = opened((tmp_path / "second.html").as_uri())
+    assert shown.locator("h1").inner_text() == f"{asset.name} v002"
+    assert shown.title().startswith(f"{asset.name} v002: ")
 
 
 @pytest.mark.parametrize(

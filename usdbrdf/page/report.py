@@ -16,6 +16,7 @@ import numpy as np
 from usdbrdf.asset.advice import read_advice
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.manifest import read_manifest
 from usdbrdf.asset.maps import AssetMaps, camera_hits
 from usdbrdf.asset.properties import FittedObject
 from usdbrdf.asset.readers.scene import read_fit
@@ -138,6 +139,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
             shown, rows = evaluated_views(options.evaluation, place)
     return {
         "name": place.name,
+        "published": read_manifest(place.folder).version if place.is_published else "",
         "version": code_version(),
         "photographs": pictures,
         "capture": {

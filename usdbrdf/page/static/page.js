@@ -33,8 +33,9 @@
 
   function capture() {
     const { capture: facts } = data;
-    document.title = `${data.name}: usdbrdf report`;
-    $('title').textContent = data.name;
+    const name = data.published ? `${data.name} ${data.published}` : data.name;
+    document.title = `${name}: usdbrdf report`;
+    $('title').textContent = name;
     const measured = data.objects.filter((one) => one.status === 'measured').length;
     $('lead').textContent = `${facts.frames} photographs, ${data.objects.length} objects, ${measured} measured`;
     $('findings').append(...data.findings.map((sentence) => el('li', {}, sentence)));
