@@ -10,8 +10,10 @@ import pytest
 
 from tests.page.conftest import data_of
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.review import read_review
-from usdbrdf.page.report import page, reviewed
+from usdbrdf.asset.review import Judgement, changes_since, read_review, write_review
+from usdbrdf.delivery.publish import publish
+from usdbrdf.options import PublishOptions
+from usdbrdf.page.report import page, report, reviewed
 from usdbrdf.page.server import PageServer
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs usdbrdf[browser]")
@@ -109,6 +111,19 @@ def test_no_error_reads_as_none_and_what_shines_is_not_said_to_lack_pixels(
     name.press("Enter")
     detail = shown.locator(f"#{name.get_attribute('aria-controls')}")
     assert "What shines by itself is not fitted." in detail.inner_text()
+
+
+def test_every_column_and_number_of_the_trade_is_explained(opened, page_file):
+    shown = opened(page_file.as_uri())
+    headings = shown.locator("#table thead th").all_inner_texts()
+    shown.get_by_text("What the columns mean").click()
+    told = shown.locator("#words dt").all_inner_texts()
+    assert set(headings) - set(told) == {"Picture", "Object", "Verdict"}
+    shown.get_by_text("What these words mean").click()
+    for word in ("FLIP", "Relative L2", "Diffuse baseline", "Full model"):
+        assert shown.locator("#slider dt", has_text=word).is_visible()
+    compared = shown.locator("#slider p").inner_text()
+    assert re.search(r"[0-9]\.[0-9] % of the pixels are compared\.$", compared)
 
 
 def test_the_slider_moves_over_the_views(opened, page_file):
@@ -228,27 +243,72 @@ def test_a_verdict_of_a_file_is_handed_over_as_a_layer(opened, page_file, room, 
     assert (said.status, said.phi) == (row["fit"], pytest.approx(row["phi"]))
 
 
-def test_a_verdict_of_a_served_page_is_saved_and_comes_back(opened, page_file, room, tmp_path):
+def test_verdicts_that_a_page_only_repeats_stay_of_what_was_judged(
+    opened, page_file, room, tmp_path
+):
     folder = tmp_path / "room"
     shutil.copytree(room.asset, folder)
     asset, data = Asset.made(folder), data_of(page_file.read_text("utf-8"))
-    label = data["objects"][0]["label"]
+    first, second = data["objects"][:2]
+    write_review(
+        asset, {first["prim"]: Judgement(verdict="reject", status="prior", phi=0.11, psi=0.22)}
+    )
+    (tmp_path / "again.html").write_text(page({**data, **reviewed(asset)}), "utf-8")
+    shown = opened((tmp_path / "again.html").as_uri())
+    judge(shown, second["label"], "good")
+    shown.get_by_role("button", name=first["label"], exact=True).click()
+    group = shown.get_by_role("group", name=f"Your verdict on {first['label']}")
+    group.get_by_label("accept").check()
+    group.get_by_label("reject").check()
+    with shown.expect_download() as download:
+        shown.get_by_role("button", name="Save verdicts").click()
+    download.value.save_as(folder / "review.usda")
+    found = read_review(asset)
+    assert (found[first["prim"]].status, found[first["prim"]].phi) == ("prior", 0.11)
+    assert found[second["prim"]].status == second["fit"]
+    assert first["prim"] in changes_since(asset)
+
+
+@pytest.fixture
+def served(room, page_file, tmp_path):
+    """A copy of the room's asset, what its page carries, and the address that serves it."""
+    folder = tmp_path / "room"
+    shutil.copytree(room.asset, folder)
+    asset, data = Asset.made(folder), data_of(page_file.read_text("utf-8"))
     server = PageServer(asset, lambda at: page({**data, **reviewed(asset)}, served=at))
     thread = threading.Thread(target=server.serve)
     thread.start()
-    try:
-        shown = opened(server.address)
-        judge(shown, label, "good")
-        shown.get_by_role("button", name="Save verdicts").click()
-        shown.get_by_text("saved in review.usda").wait_for()
-        assert shown.faults == []
-        again = opened(server.address)
-        again.locator("#filter-verdict").select_option("accept")
-        assert again.locator("#count").inner_text() == f"1 of {len(data['objects'])} objects"
-    finally:
-        server.close()
-        thread.join()
+    yield asset, data, server.address
+    server.close()
+    thread.join()
+
+
+def test_a_verdict_of_a_served_page_is_saved_and_comes_back(opened, served):
+    asset, data, address = served
+    label = data["objects"][0]["label"]
+    shown = opened(address)
+    judge(shown, label, "good")
+    shown.get_by_role("button", name="Save verdicts").click()
+    shown.get_by_text("saved in review.usda").wait_for()
+    assert shown.faults == []
+    again = opened(address)
+    again.locator("#filter-verdict").select_option("accept")
+    assert again.locator("#count").inner_text() == f"1 of {len(data['objects'])} objects"
     assert read_review(asset)[data["objects"][0]["prim"]].comment == "good"
+
+
+def test_a_page_that_was_opened_before_takes_nothing_back_that_others_said(opened, served):
+    asset, data, address = served
+    first, second = data["objects"][:2]
+    write_review(asset, {first["prim"]: Judgement(verdict="accept", status="prior")})
+    shown = opened(address)
+    write_review(asset, {first["prim"]: Judgement(verdict="reject", status="prior")})
+    judge(shown, second["label"], "good")
+    shown.get_by_role("button", name="Save verdicts").click()
+    shown.get_by_text("saved in review.usda").wait_for()
+    found = read_review(asset)
+    assert found[first["prim"]].verdict == "reject"
+    assert found[second["prim"]].verdict == "accept"
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1440, "light"), (390, "dark")])
@@ -303,7 +363,8 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     data = data_of(page_file.read_text("utf-8"))
     metal, guess, *_ = (row for row in data["objects"] if row["status"] != "lamp")
     metal.update(f0=[0.9, 0.6, 0.3], psi=1.0, psi_confidence="high")
-    guess.update(f0=None, psi=0.25, psi_error=0.5, phi_confidence="none", psi_confidence="none")
+    unsure = {"f0": None, "phi_confidence": "none", "psi_confidence": "none"}
+    guess.update(unsure, psi=0.0, psi_error=0.29, psi_upper=0.96)
     data["warnings"] = [f"number {i} is wrong" for i in range(12)]
     (tmp_path / "metal.html").write_text(page(data), "utf-8")
     shown = opened((tmp_path / "metal.html").as_uri())
@@ -313,12 +374,36 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     }
     assert cells[metal["prim"]].nth(1).inner_text() == "metal"
     assert "F0 high" in shown.locator(f'tr[data-prim="{metal["prim"]}"]').inner_text()
-    assert cells[guess["prim"]].nth(1).inner_text() == "0.25 \u00b1 0.50"
+    assert cells[guess["prim"]].nth(1).inner_text() == "0.00, below 0.96"
     colour = "x => getComputedStyle(x).color"
     assert cells[guess["prim"]].nth(1).evaluate(colour) == shown.locator("#lead").evaluate(colour)
     assert shown.locator("#warnings .warning:visible").count() == 8
     shown.get_by_text("4 more warnings").click()
     assert shown.locator("#warnings .warning:visible").count() == 12
+    assert shown.faults == []
+
+
+def test_the_page_of_a_version_says_which_it_is(opened, page_file, room, tmp_path):
+    asset = Asset.made(room.asset)
+    assert data_of(page_file.read_text("utf-8"))["published"] == ""
+    for name in ("v001", "v002"):
+        publish(
+            asset.folder, tmp_path / "dest", PublishOptions(version=name, uri=f"studio://{name}")
+        )
+    report(tmp_path / "dest" / "v002", tmp_path / "second.html")
+    shown = opened((tmp_path / "second.html").as_uri())
+    assert shown.locator("h1").inner_text() == f"{asset.name} v002"
+    assert shown.title().startswith(f"{asset.name} v002: ")
+
+
+@pytest.mark.parametrize(
+    ("warnings", "told"), [([], "No warnings."), (None, "What was warned of is not known here")]
+)
+def test_no_warning_is_told_apart_from_none_known(opened, page_file, tmp_path, warnings, told):
+    data = {**data_of(page_file.read_text("utf-8")), "warnings": warnings, "room": None}
+    (tmp_path / "quiet.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "quiet.html").as_uri())
+    assert shown.locator("#warnings").inner_text().startswith(told)
     assert shown.faults == []
 
 

@@ -23,8 +23,9 @@ from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView, measured_atlas, viewed_asset
 from usdbrdf.model.material import turned_up
 from usdbrdf.page import objects, views
-from usdbrdf.page.capture import findings
+from usdbrdf.page.capture import findings, warnings_of
 from usdbrdf.page.daylight import _around, daylight
+from usdbrdf.page.objects import undetermined_because, why
 from usdbrdf.page.pictures import (
     _BACKGROUND,
     Seen,
@@ -302,8 +303,54 @@ def test_the_counts_of_all_objects_are_told_and_hundreds_of_lamps_in_one_sentenc
     assert told[-1].endswith(" and 194 more clipped everywhere: their radiances are estimates.")
     alone = findings({"texture": {}, "shade": {"estimated_emitters": {"bulb": 1}}}, words, True)
     assert alone[-1] == "The lamp bulb clipped everywhere: its radiance is an estimate."
+    hidden = {f"bulb_{i}" for i in range(199)} | {"stage"}
+    shown, unseen = findings(found, words, True, hidden)[-2:]
+    assert shown == "The lamp bulb_199 clipped everywhere: its radiance is an estimate."
+    assert unseen.startswith("No photograph measures the lamps bulb_0, bulb_1,")
+    assert unseen.endswith(" and 193 more: their radiances are estimates.")
+    parts = findings({"texture": {}, "shade": {}}, ["lamp"], True, (), ["table", "shelf"])
+    assert parts[1:] == ["1 is a lamp.", "A part of table, shelf shines, too."]
     (one,) = (line for line in findings({"texture": {}, "shade": {}}, ["failed"], True)[1:])
     assert one == "The fit of 1 failed: its photographs do not determine the numbers."
+
+
+def test_where_no_step_left_its_record_warnings_are_not_said_to_be_none():
+    steps = ("ingest", "texture", "shade", "fit")
+    nothing = {step: {} for step in steps}
+    assert warnings_of(nothing) is None
+    assert warnings_of({**nothing, "fit": {"objects": {}}}) == []
+    assert warnings_of({**nothing, "shade": {"warnings": ["dark"]}}) == ["dark"]
+
+
+def test_nothing_that_a_photograph_shows_is_said_to_be_in_none():
+    share = np.array([[0, 0.1, 0], [0, 0, 0]], np.float32)
+    assert Seen(share=share, box=np.zeros((2, 3, 4), np.float32)).in_sight.tolist() == [0, 1, 0]
+    assert undetermined_because(fit_of(), "unseen", in_sight=True) == "glimpsed"
+    assert undetermined_because(fit_of(), "unseen") == "unseen"
+    told = findings({"texture": {}, "shade": {}}, ["unseen", "glimpsed", "glimpsed"], True)
+    assert told[1:] == [
+        "Photographs hardly show 2: nothing on them was measured, and everything is a guess.",
+        "No photograph shows 1 of them.",
+    ]
+    assert why(fit_of(), "unseen", None, in_sight=False).startswith("No photograph shows it: ")
+    assert why(fit_of(), "unseen", None, in_sight=True).startswith("Photographs hardly show it")
+
+
+@pytest.mark.parametrize(
+    ("status", "observed", "told"),
+    [
+        ("measured", True, "It shines; its radiance was measured."),
+        ("estimated", True, "It shines and clipped in every photograph: its radiance is estimated "
+         "from the light that it casts."),
+        ("estimated", False, "It shines where no photograph measures it: its radiance is estimated "
+         "from the light that it casts."),
+        ("lowerBound", True, "It shines and clipped in every photograph: its radiance is a lower "
+         "bound."),
+    ],
+)  # fmt: skip
+def test_of_a_lamp_it_is_said_why_its_radiance_is_what_it_is(status, observed, told):
+    shading = SimpleNamespace(radiance_status=status, directive="")
+    assert why(fit_of(), "lamp", shading, observed=observed) == told
 
 
 @pytest.mark.parametrize("up_axis", ["Y", "Z"])

@@ -18,7 +18,7 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.page import server as server_module
 from usdbrdf.page.server import PageServer
 
-CHAIR = "/room/geo/Stuhl_No_1/Stuhl_No_1"
+CHAIR, WALL = "/room/geo/Stuhl_No_1/Stuhl_No_1", "/room/geo/wall/wall"
 
 
 @pytest.fixture
@@ -72,6 +72,39 @@ def test_verdicts_are_written_for_the_page_alone(server, built):
     assert not review_file(built.asset).exists()
     assert asked(server, "POST", path, body, Origin=own, **kind) == (200, b"saved")
     assert read_review(built.asset)[CHAIR].comment == "fine"
+
+
+def test_what_two_servers_take_at_once_is_all_kept(server, built, monkeypatch):
+    """Other processes are stood for by a server that knows nothing of the first."""
+    other = PageServer(built.asset, lambda review: review)
+    thread = threading.Thread(target=other.serve)
+    thread.start()
+    written = server_module.write_review
+
+    def slowly(asset, judgements):
+        time.sleep(0.5)
+        written(asset, judgements)
+
+    monkeypatch.setattr(server_module, "write_review", slowly)
+    statuses = []
+
+    def say(one, prim):
+        path = urlsplit(one.address).path + "review"
+        body = json.dumps({prim: {"verdict": "accept"}})
+        answer = asked(one, "POST", path, body, **{"Content-Type": "application/json"})
+        statuses.append(answer)
+
+    asking = [threading.Thread(target=say, args=pair) for pair in ((server, CHAIR), (other, WALL))]
+    try:
+        for one in asking:
+            one.start()
+        for one in asking:
+            one.join()
+    finally:
+        other.close()
+        thread.join()
+    assert statuses == [(200, b"saved")] * 2
+    assert set(read_review(built.asset)) == {CHAIR, WALL}
 
 
 def said_to(server, request, *, reset=False):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -88,3 +89,18 @@ def test_light_is_doubted_as_the_lamps_that_bring_most_of_it():
     assert _doubt(texels, clipped, unseen, None) == pytest.approx(both)
     clipped.estimate.determined[:] = False
     assert _doubt(texels, clipped, none, None) == 0
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+def test_a_lamp_that_no_frame_shows_wants_a_photograph_and_no_shorter_exposure(hidden):
+    found = replace(
+        _shaded(emits=True),
+        unseen=SimpleNamespace(object=[0] if hidden else [], error_of=lambda _: 0.07),
+        emitters=SimpleNamespace(
+            emissive=np.ones(4, np.bool_), lower_bound=[True], radiance=np.ones((1, 3))
+        ),
+    )
+    (doubt,) = found.doubts(["bulb"])
+    wanted = "Photograph it to measure it." if hidden else "Capture a shorter exposure to measure"
+    assert wanted in doubt
+    assert ("exposure" in doubt) != hidden

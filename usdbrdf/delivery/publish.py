@@ -17,7 +17,7 @@ from pxr import Sdf
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layers.interface import UNPUBLISHED
 from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
+from usdbrdf.asset.manifest import MANIFEST, Manifest, changes, read_manifest, write_manifest
 from usdbrdf.asset.readers.compose import not_run, open_edited, outdated_steps, steps_to_come
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
@@ -67,6 +67,13 @@ def publish(
             f"{destination}: this is a file, and versions are published into a folder. Choose "
             "another place. [publish.destination]"
         )
+    inner = destination.absolute()
+    for folder in (inner, *inner.parents):
+        if (folder / MANIFEST).is_file() and _VERSION.fullmatch(folder.name):
+            raise OwnershipConflict(
+                f"{destination}: {folder} is a published version, which never changes. Name the "
+                "folder of all versions. [publish.destination]"
+            )
     with reading(asset.folder, wait_s=wait_s):
         _refuse_unsound(asset, options)
         with (

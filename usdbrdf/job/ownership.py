@@ -128,6 +128,20 @@ def reading(*places: Path, wait_s: float = 0.0) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def writing_alone(folder: Path) -> Iterator[None]:
+    """Hold what all processes that call this of a folder hold in turn, for moments: between reading
+    and writing a file that a run leaves alone. Where the file system has no such locks nothing is
+    held. Nothing is left in the folder, which may be of people alone."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def reads_asset(*names: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """A function that reads the assets in its arguments of these names; see ``reading``."""
 

@@ -3,7 +3,7 @@ exposed, what was found and what not, in words."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,8 +40,11 @@ def summaries(asset: Asset) -> dict[str, dict[str, Any]]:
     return found
 
 
-def warnings_of(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """All sentences of warning, in the order of the steps."""
+def warnings_of(found: Mapping[str, Mapping[str, Any]]) -> list[str] | None:
+    """All sentences of warning, in the order of the steps; None where no step's stamp is there: a
+    published version does not hold what they told."""
+    if not any(found[step] for step in STEPS):
+        return None
     return [str(sentence) for step in STEPS for sentence in found[step].get("warnings", ())]
 
 
@@ -132,10 +135,18 @@ def _from_above(
 
 
 def findings(
-    found: Mapping[str, Mapping[str, Any]], words: Sequence[str], radiometric: bool
+    found: Mapping[str, Mapping[str, Any]],
+    words: Sequence[str],
+    radiometric: bool,
+    never_observed: Collection[str] = (),
+    shining_parts: Sequence[str] = (),
 ) -> list[str]:
-    """What was found, what not and why, in sentences. words: of each object, see ``status_of`` and
-    ``undetermined_because``."""
+    """What was found, what not and why, in sentences.
+
+    words           of each object, see ``status_of`` and ``undetermined_because``
+    never_observed  identifiers of objects of which no frame tells anything
+    shining_parts   those of objects that are no lamps but of a small part
+    """
     count = {word: words.count(word) for word in set(words)}
     total = len(words)
     told = [
@@ -164,10 +175,17 @@ def findings(
             f"The fit of {failed} failed: {'its' if failed == 1 else 'their'} photographs do not "
             "determine the numbers."
         )
+    if glimpsed := count.get("glimpsed"):
+        told.append(
+            f"Photographs hardly show {glimpsed}: nothing on {'it' if glimpsed == 1 else 'them'} "
+            "was measured, and everything is a guess."
+        )
     if unseen := count.get("unseen"):
         told.append(f"No photograph shows {unseen if unseen < total else 'any'} of them.")
     if lamps := count.get("lamp"):
         told.append(f"{lamps} {'is a lamp' if lamps == 1 else 'are lamps'}.")
+    if shining_parts:
+        told.append(f"A part of {_few(shining_parts)} shines, too.")
     texture, shade = found["texture"], found["shade"]
     if "measured_fraction" in texture:
         told.append(
@@ -182,7 +200,10 @@ def findings(
             f"{escaped:.1%} of the directions in which surfaces look leave the scan. "
             f"{_outside(shade.get('outside'))}"
         )
-    told += _clipped_lamps(list(shade.get("estimated_emitters", {})))
+    estimated = list(shade.get("estimated_emitters", {}))
+    for wanted in (False, True):
+        names = [name for name in estimated if (name in never_observed) == wanted]
+        told += _estimated_lamps(names, never_observed=wanted)
     if not radiometric:
         told.append("The images are not radiometric: albedo and fit have no absolute meaning.")
     return told
@@ -199,14 +220,17 @@ def _outside(found: Mapping[str, Any] | None) -> str:
     return f"The light from there was estimated: {', '.join(told)}."
 
 
-def _clipped_lamps(names: Sequence[str]) -> list[str]:
+def _estimated_lamps(names: Sequence[str], *, never_observed: bool) -> list[str]:
     """In one sentence at most, also of a room with hundreds."""
     if not names:
         return []
-    if len(names) == 1:
-        return [f"The lamp {names[0]} clipped everywhere: its radiance is an estimate."]
-    shown, more = names[:_NAMED_LAMPS], len(names) - _NAMED_LAMPS
-    rest = f" and {more} more" if more > 0 else ""
-    return [
-        f"The lamps {', '.join(shown)}{rest} clipped everywhere: their radiances are estimates."
-    ]
+    one = len(names) == 1
+    lamps = f"he lamp{'' if one else 's'} {_few(names)}"
+    how = f"No photograph measures t{lamps}" if never_observed else f"T{lamps} clipped everywhere"
+    what = "its radiance is an estimate" if one else "their radiances are estimates"
+    return [f"{how}: {what}."]
+
+
+def _few(names: Sequence[str]) -> str:
+    more = len(names) - _NAMED_LAMPS
+    return ", ".join(names[:_NAMED_LAMPS]) + (f" and {more} more" if more > 0 else "")

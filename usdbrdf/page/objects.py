@@ -51,7 +51,9 @@ def object_rows(
     photographs    whether pictures may be photographs
     """
     objects = atlas.scene.objects
-    rows = [_numbers(atlas, i, obj, fits[i]) for i, obj in enumerate(objects)]
+    rows = [
+        _numbers(atlas, i, obj, fits[i], bool(where.in_sight[i])) for i, obj in enumerate(objects)
+    ]
     shown = [_place_of(where, chosen, i, fits[i].target_frame) for i in range(len(objects))]
     # By their frames, so that each frame is read once however many objects it shows.
     order = sorted((at, i) for i, at in enumerate(shown) if at is not None)
@@ -95,10 +97,13 @@ def _place_of(where: Seen, chosen: Sequence[int], index: int, target: int) -> in
     return most if share[most] > 0 else None
 
 
-def _numbers(atlas: AssetMaps, index: int, obj: SceneObject, fit: FittedObject) -> dict[str, Any]:
+def _numbers(
+    atlas: AssetMaps, index: int, obj: SceneObject, fit: FittedObject, in_sight: bool
+) -> dict[str, Any]:
     texels, own = atlas.texels, atlas.texels.of_object(index)
     status = status_of(atlas, index, fit)
     shading = read_shading(atlas.stage, obj.prim_path)
+    observed = bool(atlas.coverage.observed[own].any())
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), None)
     base = texels.mean_of_object(index, atlas.map_where_present(colours, 3)) if colours else None
     return {
@@ -124,7 +129,7 @@ def _numbers(atlas: AssetMaps, index: int, obj: SceneObject, fit: FittedObject) 
         "clipped": round(float(atlas.coverage.clipped[own].mean()), 4),
         "area": round(float(texels.area[own].sum()), 4),
         "radiance": _radiance(shading),
-        "why": why(fit, status, shading),
+        "why": why(fit, status, shading, in_sight=in_sight, observed=observed),
         "target": fit.target_frame,
     }
 
@@ -137,19 +142,32 @@ def _radiance(shading: ShadedObject | None) -> dict[str, Any] | None:
             "error": finite(shading.radiance_error, 4)}  # fmt: skip
 
 
-def why(fit: FittedObject, status: str, shading: ShadedObject | None) -> str:
-    """In a sentence or two, why the numbers of an object are to be believed, or not."""
+def why(
+    fit: FittedObject,
+    status: str,
+    shading: ShadedObject | None,
+    *,
+    in_sight: bool = True,
+    observed: bool = True,
+) -> str:
+    """In a sentence or two, why the numbers of an object are to be believed, or not.
+
+    in_sight  whether it lies in the sight of a camera
+    observed  whether a frame tells something of any of its texels, if only that it clips
+    """
     if directive := _by_directive(fit, shading):
         return directive
     if status == "lamp":
         known = shading.radiance_status if shading else "measured"
-        return {
-            "measured": "It shines; its radiance was measured.",
-            "estimated": "It shines and clipped in every photograph: its radiance is estimated "
-            "from the light that it casts.",
-        }.get(known, "It shines and clipped in every photograph: its radiance is a lower bound.")
+        if known == "measured":
+            return "It shines; its radiance was measured."
+        how = "and clipped in every photograph" if observed else "where no photograph measures it"
+        what = "estimated from the light that it casts" if known == "estimated" else "a lower bound"
+        return f"It shines {how}: its radiance is {what}."
     if status == "unseen":
-        return "No photograph shows it: everything about it is a guess."
+        hardly = "Photographs hardly show it, and nothing on it was measured"
+        shown = hardly if in_sight else "No photograph shows it"
+        return f"{shown}: everything about it is a guess."
     if fit.is_metal:
         return "A metal explains the views better than any dielectric: F0 takes the place of psi."
     if fit.is_contradicted:
@@ -170,9 +188,12 @@ def why(fit: FittedObject, status: str, shading: ShadedObject | None) -> str:
     return f"{explained} {known}{bound}"
 
 
-def undetermined_because(fit: FittedObject | None, status: str) -> str:
+def undetermined_because(fit: FittedObject | None, status: str, *, in_sight: bool = False) -> str:
     """One word about why the numbers of an object are not known: "told" where a person said that
-    nothing be fitted, "contradicted", "sparse" where too little was seen; else ``status``."""
+    nothing be fitted, "contradicted", "sparse" where too little was seen, "glimpsed" where an
+    object that counts as unseen lies ``in_sight`` of a camera; else ``status``."""
+    if status == "unseen" and in_sight:
+        return "glimpsed"
     if fit is None or status != "prior":
         return status
     if fit.directive in ("ignore", "glass"):

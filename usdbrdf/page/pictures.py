@@ -61,6 +61,11 @@ class Seen:
     share: Float
     box: Float
 
+    @property
+    def in_sight(self) -> Bool:
+        """(num_objects,): whether any of the frames has an object in its sight."""
+        return np.asarray(self.share.any(axis=0), np.bool_)
+
 
 def objects_in_frames(rays: RayScene, face_object: Int, count: int, frames: Frames) -> Seen:
     """``count`` objects looked for in each frame, coarsely."""

@@ -6,8 +6,8 @@ The page is data (JSON) and the parts of ``static``; nothing is loaded when it i
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from usdbrdf.asset.advice import read_advice
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.manifest import read_manifest
 from usdbrdf.asset.maps import AssetMaps, camera_hits
 from usdbrdf.asset.properties import FittedObject
 from usdbrdf.asset.readers.scene import read_fit
@@ -24,6 +25,7 @@ from usdbrdf.asset.review import changes_since, read_review
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
+from usdbrdf.evaluation.metrics import finite
 from usdbrdf.files.atomic import environment_failures, write_text_atomic
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reading
@@ -117,10 +119,14 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     fits = [_in_own_frames(atlas, obj.prim_path) for obj in atlas.scene.objects]
     known = [fit for fit in fits if fit is not None]
     words = [status_of(atlas, i, fit) for i, fit in enumerate(fits)]
-    reasons = [undetermined_because(fit, word) for fit, word in zip(fits, words, strict=True)]
     frames, found, advice = atlas.frames, summaries(place), read_advice(place)
     chosen = _frames_to_search(len(frames), known)
     where = objects_in_frames(seen.lit.rays, atlas.scene.face_object, len(words), frames.at(chosen))
+    reasons = [
+        undetermined_because(fit, word, in_sight=bool(where.in_sight[i]))
+        for i, (fit, word) in enumerate(zip(fits, words, strict=True))
+    ]
+    lamps = [o.identifier for o, w in zip(atlas.scene.objects, words, strict=True) if w == "lamp"]
     widest = chosen[shows_most(where.share)]
     pictures = options.photographs
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
@@ -133,6 +139,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
             shown, rows = evaluated_views(options.evaluation, place)
     return {
         "name": place.name,
+        "published": read_manifest(place.folder).version if place.is_published else "",
         "version": code_version(),
         "photographs": pictures,
         "capture": {
@@ -145,12 +152,18 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
             "triangles": len(atlas.scene.triangles),
             "texels": len(atlas.texels),
         },
-        "findings": findings(found, reasons, bool(frames.radiometric)),
-        "warnings": [
-            sentence
-            for sentence in warnings_of(found)
-            if pictures or not any(path.name in sentence for path in frames.image_paths)
-        ],
+        "findings": findings(
+            found,
+            reasons,
+            bool(frames.radiometric),
+            _with_texels(atlas, lambda own: not atlas.coverage.observed[own].any()),
+            [
+                name
+                for name in _with_texels(atlas, lambda own: bool(atlas.emissive[own].any()))
+                if name not in lamps
+            ],
+        ),
+        "warnings": _tellable(warnings_of(found), frames, pictures),
         "rows": [unnamed(row, pictures) for row in frame_rows(frames)],
         "map": room_map(
             atlas,
@@ -186,13 +199,31 @@ def _refuse_without_photographs(asset: Asset, frames: Frames) -> None:
 
 
 def reviewed(asset: Asset) -> dict[str, Any]:
-    """What people said of the objects by now, and what changed since."""
-    said = read_review(asset)
-    words = ("verdict", "comment", "directive")
+    """What people said of the objects by now, of which numbers, and what changed since."""
+    said = {path: asdict(one) for path, one in read_review(asset).items()}
     return {
-        "review": {path: {w: getattr(one, w) for w in words} for path, one in said.items()},
+        "review": {
+            path: {**one, "phi": finite(one["phi"]), "psi": finite(one["psi"])}
+            for path, one in said.items()
+        },
         "changed": changes_since(asset),
     }
+
+
+def _tellable(warnings: list[str] | None, frames: Frames, photographs: bool) -> list[str] | None:
+    """Without those that name a photograph, unless these may be shown."""
+    if warnings is None or photographs:
+        return warnings
+    return [w for w in warnings if not any(path.name in w for path in frames.image_paths)]
+
+
+def _with_texels(atlas: AssetMaps, holds: Callable[[slice], bool]) -> list[str]:
+    """Identifiers of objects of whose texels something holds."""
+    return [
+        obj.identifier
+        for i, obj in enumerate(atlas.scene.objects)
+        if holds(atlas.texels.of_object(i))
+    ]
 
 
 def _in_own_frames(atlas: AssetMaps, prim_path: str) -> FittedObject | None:

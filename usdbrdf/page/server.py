@@ -23,7 +23,7 @@ from typing import Any
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.review import judgements_of, write_review
 from usdbrdf.errors import EnvironmentFailure, UsdBrdfError
-from usdbrdf.job.ownership import reading
+from usdbrdf.job.ownership import reading, writing_alone
 from usdbrdf.job.progress import say
 from usdbrdf.options import ReportOptions
 from usdbrdf.page.report import page, page_data, reviewed
@@ -111,7 +111,8 @@ class PageServer:
 
             def _take(self, content: bytes) -> None:
                 try:
-                    with writing:
+                    # Others may serve it too, and what they save meanwhile would be lost.
+                    with writing, writing_alone(asset.folder):
                         write_review(asset, judgements_of(asset, json.loads(content)))
                 except (ValueError, RecursionError):
                     self._answer(400, b"no JSON")

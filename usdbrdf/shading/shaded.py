@@ -283,11 +283,13 @@ class Shaded:
                 )
             elif status == "estimated":
                 radiance = ", ".join(f"{value:.3g}" for value in self.emitters.radiance[i])
-                how = "no frame shows it" if i in self.unseen.object else "saturated in every frame"
+                hidden = i in self.unseen.object
+                how = "no frame shows it" if hidden else "saturated in every frame"
+                what = "Photograph it" if hidden else "Capture a shorter exposure"
                 yield (
                     f"{identifier}: {how}; from the light that it casts its "
-                    f"radiance is {radiance}, +-{100 * self.radiance_error(i):.0f} %. Capture a "
-                    "shorter exposure to measure it. [shading.estimated]"
+                    f"radiance is {radiance}, +-{100 * self.radiance_error(i):.0f} %. {what} "
+                    "to measure it. [shading.estimated]"
                 )
         error = float(np.median(self.relative_error))
         if error > _NOISY:

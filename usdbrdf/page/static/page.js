@@ -33,19 +33,23 @@
 
   function capture() {
     const { capture: facts } = data;
-    document.title = `${data.name}: usdbrdf report`;
-    $('title').textContent = data.name;
+    const name = data.published ? `${data.name} ${data.published}` : data.name;
+    document.title = `${name}: usdbrdf report`;
+    $('title').textContent = name;
     const measured = data.objects.filter((one) => one.status === 'measured').length;
     $('lead').textContent = `${facts.frames} photographs, ${data.objects.length} objects, ${measured} measured`;
     $('findings').append(...data.findings.map((sentence) => el('li', {}, sentence)));
-    const warned = data.warnings.map((sentence) =>
+    const warned = (data.warnings || []).map((sentence) =>
       el('p', { class: 'warning' }, el('strong', {}, 'Warning: '), sentence));
     const first = warned.length > MOST_WARNINGS + 1 ? MOST_WARNINGS : warned.length;
     $('warnings').append(...warned.slice(0, first));
     if (first < warned.length) {
       $('warnings').append(el('details', {}, el('summary', {}, `${warned.length - first} more warnings`), ...warned.slice(first)));
     }
-    if (!data.warnings.length) $('warnings').append(el('p', { class: 'soft' }, 'No warnings.'));
+    if (!warned.length) {
+      $('warnings').append(el('p', { class: 'soft' }, data.warnings ? 'No warnings.'
+        : 'What was warned of is not known here: a published version does not hold it. The page of the asset tells.'));
+    }
     const told = [
       ...(facts.lighting ? [['Lighting', facts.lighting]] : []),
       ['Photographs', `${facts.frames}, ${facts.resolution.join(' \u00d7 ')} pixels, ${facts.encoding}`],
@@ -165,12 +169,17 @@
   const review = new Map(Object.entries(data.review || {}));
   const changed = data.changed || {};
   let unsaved = false;
+  // What was said on this page since it last saved: others may have said more of the rest by now.
+  const said = new Map();
   const judged = (prim) => review.get(prim) || { verdict: '', comment: '', directive: '' };
   const encoded = (linear) => {
     const value = Math.min(Math.max(linear, 0), 1);
     return Math.round(255 * (value <= 0.0031308 ? 12.92 * value : 1.055 * value ** (1 / 2.4) - 0.055));
   };
   const css = (colour) => (colour ? `rgb(${colour.map(encoded).join(' ')})` : 'transparent');
+  // Where psi is not known its deviation tells less than what it is below: the guess may be 0.
+  const noMoreThan = (one) => (one.psi_upper !== null && one.psi_upper < 0.995 ? `below ${fixed(one.psi_upper)}` : 'up to 1');
+  const isGuess = (one) => one.psi !== null && one.psi_confidence === 'none';
   const certain = { high: 0, low: 1, none: 2 };
   const order = Object.keys(STATUS);
   const COLUMNS = [
@@ -187,7 +196,21 @@
   ];
   const rows = [];
 
+  /* What the words of the trade say, for who judges without them. */
+  const WORDS = {
+    Status: 'measured: the photographs determine roughness and specular. Not determined: no photograph shows a clear enough highlight, and the grey numbers are what remains likely. Unseen: no photograph shows enough of the object to measure anything.',
+    Colour: 'the mean of the base colour: what the object reflects to all sides, without highlights and without the light that fell on it.',
+    'Roughness \u03c6': 'how wide highlights are: 0 a mirror, 1 matt (alpha of the GGX distribution; the roughness of most renderers is its square root). \u00b1: one standard deviation.',
+    'Specular \u03c8': 'how strong they are: 0.5 is usual for wood, paint and plastics, 0 has none (what is mirrored straight ahead is 0.08 \u03c8 of the light). Of metals a colour, F0, takes its place.',
+    Sure: 'how far \u03c6 and \u03c8 are to be believed: high, low, or none: a guess.',
+    Evidence: 'how much of what changes from view to view the highlight explains: 0 % nothing, 100 % all.',
+    Seen: 'the share of the surface that photographs measured; the rest is filled in from around it.',
+  };
+  const words = (told) => el('dl', { class: 'facts' },
+    ...Object.entries(told).flatMap(([word, meaning]) => [el('dt', {}, word), el('dd', {}, meaning)]));
+
   function objects() {
+    $('words').append(words(WORDS));
     const head = $('table').tHead.rows[0];
     COLUMNS.forEach((column, i) => {
       const cell = el('th', { scope: 'col', class: column.wide ? 'wide' : '' });
@@ -217,8 +240,9 @@
   function row(one, i) {
     const picture = one.photograph || one.model;
     const swatch = el('span', { class: 'swatch', style: `background: ${css(one.base_color)}` });
-    const number = (value, error) => {
+    const number = (value, error, guess = false) => {
       if (one.status === 'lamp') return ['\u2013'];
+      if (guess) return [fixed(value), el('span', { class: 'error' }, `, ${noMoreThan(one)}`)];
       // An error that would read as 0.00 gets another digit, and its number with it.
       const digits = error !== null && error < 0.005 ? 3 : 2;
       const parts = [fixed(value, digits)];
@@ -231,7 +255,7 @@
       onclick: () => open(entry, detail.hidden),
     }, one.label);
     // Of metals F0, a colour, takes the place of psi.
-    const specular = one.f0 && one.status !== 'lamp' ? ['metal'] : number(one.psi, one.psi_error);
+    const specular = one.f0 && one.status !== 'lamp' ? ['metal'] : number(one.psi, one.psi_error, isGuess(one));
     const numberCss = (confidence) => (confidence === 'none' ? 'number guess' : 'number');
     const verdict = el('td', { class: 'wide' });
     const status = (css) => el('span', { class: `status ${one.status} ${css}` }, STATUS[one.status]);
@@ -389,7 +413,12 @@
       el('label', {}, el('input', { type: 'radio', name, value, checked: value === now.verdict, onchange: note }), ` ${text}`));
     function note() {
       const chosen = form.querySelector('input:checked').value;
-      review.set(one.prim, { verdict: chosen, comment: comment.value.trim(), directive: directive.value });
+      const words = { verdict: chosen, comment: comment.value.trim(), directive: directive.value };
+      const first = (data.review || {})[one.prim];
+      // Said again as it was, it was judged then, of what was there then.
+      const same = first && Object.keys(words).every((word) => words[word] === first[word]);
+      review.set(one.prim, same ? first : words);
+      said.set(one.prim, words);
       unsaved = true;
       $('saved').textContent = 'not saved yet';
       showVerdict(entry);
@@ -409,11 +438,12 @@
   function layer() {
     const tree = {};
     for (const one of data.objects) {
-      const { verdict, comment, directive } = judged(one.prim);
+      const now = judged(one.prim), { verdict, comment, directive } = now;
       if (!(verdict || comment || directive)) continue;
+      const { status, phi, psi } = 'status' in now ? now : { ...one, status: one.fit };
       let node = tree;
       for (const part of one.prim.split('/').filter(Boolean)) node = (node[part] ??= {});
-      node[''] = { verdict, comment, directive, status: one.fit, phi: one.phi, psi: one.psi };
+      node[''] = { verdict, comment, directive, status, phi, psi };
     }
     const write = (node, indent) => Object.entries(node).filter(([name]) => name).map(([name, inner]) => {
       const said = inner[''], pad = ' '.repeat(indent);
@@ -433,15 +463,19 @@
 
   async function save() {
     if (data.served) {
+      const sent = [...said];
       const answer = await fetch(data.served, {
         method: 'POST', headers: { 'Content-Type': 'application/json' },
-        body: JSON.stringify(Object.fromEntries(review)),
+        body: JSON.stringify(Object.fromEntries(sent)),
       }).catch(() => null);
       if (!answer || !answer.ok) {
         $('saved').textContent = answer ? `not saved: ${await answer.text()}` : 'not saved: usdbrdf view has ended';
         return;
       }
       $('saved').textContent = 'saved in review.usda';
+      for (const [prim, words] of sent) if (said.get(prim) === words) said.delete(prim);
+      unsaved = said.size > 0;
+      return;
     } else {
       const link = el('a', {
         href: URL.createObjectURL(new Blob([layer()], { type: 'text/plain' })), download: 'review.usda',
@@ -487,7 +521,7 @@
       under.alt = `${title(one)}: ${PICTURES[right.value]}`;
       tags[0].textContent = PICTURES[left.value]; tags[1].textContent = PICTURES[right.value];
       const { row } = one;
-      told.textContent = `FLIP ${fixed(row.flip_baseline, 4)} (baseline), ${fixed(row.flip_full, 4)} (full model); relative L2 without lamps ${fixed(row.l2_baseline, 4)} and ${fixed(row.l2_full, 4)}; ${percent(row.compared, 0)} of the pixels are compared.`;
+      told.textContent = `FLIP ${fixed(row.flip_baseline, 4)} (baseline), ${fixed(row.flip_full, 4)} (full model); relative L2 without lamps ${fixed(row.l2_baseline, 4)} and ${fixed(row.l2_full, 4)}; ${percent(row.compared)} of the pixels are compared.`;
       flips.replaceChildren(...['baseline', 'full'].map((model) => el('figure', {},
         el('img', { src: one[`flip_${model}`], alt: `FLIP error map of the ${PICTURES[model]}, ${title(one)}` }),
         el('figcaption', {}, `FLIP, ${PICTURES[model]}: mean ${fixed(row[`flip_${model}`], 4)}. Black: equal; pale yellow: wrong; grey: not compared.`))));
@@ -504,6 +538,12 @@
     const line = (metric) => ['baseline', 'full'].map((model) => ({
       name: PICTURES[model], css: model, points: data.plot.map((row) => [row.number, row[`${metric}_${model}`] ?? NaN]),
     }));
+    body.append(el('details', {}, el('summary', {}, 'What these words mean'), words({
+      'Diffuse baseline': 'the asset without highlights: what each place sends to all sides alike.',
+      'Full model': 'the asset as it was measured, highlights included.',
+      FLIP: 'how different two pictures look to people who switch between them: 0 equal, 1 the most there is.',
+      'Relative L2': 'the error of the radiance, as a share of the photograph\u2019s: 0.05 is 5 %.',
+    })));
     $('plots').append(
       chart('Relative L2 over the frames', 'without lamps; small pictures', line('l2')),
       chart('FLIP over the frames', 'mean of small pictures', line('flip')));
@@ -564,7 +604,7 @@
       const one = data.objects.find((other) => other.prim === prim);
       picked.textContent = !one ? '' : one.status === 'lamp' ? `${one.label}: lamp`
         : `${one.label}: ${STATUS[one.status]}, \u03c6 ${fixed(one.phi)} \u00b1 ${fixed(one.phi_error)}, ${one.f0
-          ? `metal, F0 ${one.f0.map((value) => fixed(value)).join(', ')}` : `\u03c8 ${fixed(one.psi)} \u00b1 ${fixed(one.psi_error)}`}`;
+          ? `metal, F0 ${one.f0.map((value) => fixed(value)).join(', ')}` : `\u03c8 ${fixed(one.psi)}${isGuess(one) ? `, ${noMoreThan(one)}` : ` \u00b1 ${fixed(one.psi_error)}`}`}`;
       canvas.dataset.picked = one ? one.prim : '';
     };
     let model;
