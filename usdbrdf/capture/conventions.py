@@ -83,22 +83,26 @@ CONVENTIONS: dict[str, Callable[[Double], Double]] = {
     **_beside_turned_meshes(),
     **_beside_mirrored_meshes(),
 }
+
+
+def _of_units() -> dict[str, Callable[[Double], Double]]:
+    farther = {
+        "centimetres and a mesh in millimetres": 10.0,
+        "metres and a mesh in centimetres": 100.0,
+        "metres and a mesh in millimetres": 1000.0,
+        "metres and a mesh in inches": 1 / 0.0254,
+        "metres and a mesh in feet": 1 / 0.3048,
+        "millimetres and a mesh in centimetres": 0.1,
+        "centimetres and a mesh in metres": 0.01,
+        "millimetres and a mesh in metres": 0.001,
+        "inches and a mesh in metres": 0.0254,
+        "feet and a mesh in metres": 0.3048,
+    }
+    return {
+        f"positions in {units} (scale the mesh by {1 / factor:.6g})": _farther(factor)
+        for units, factor in farther.items()
+    }
+
+
 # And of units, of which hits do not tell: from one point in a room everything is hit.
-_LONGER = {
-    10.0: "centimetres and a mesh in millimetres",
-    100.0: "metres and a mesh in centimetres",
-    1000.0: "metres and a mesh in millimetres",
-    1 / 0.0254: "metres and a mesh in inches",
-    1 / 0.3048: "metres and a mesh in feet",
-}
-_SHORTER = {
-    0.1: "millimetres and a mesh in centimetres",
-    0.01: "centimetres and a mesh in metres",
-    0.001: "millimetres and a mesh in metres",
-    0.0254: "inches and a mesh in metres",
-    0.3048: "feet and a mesh in metres",
-}
-UNITS: dict[str, Callable[[Double], Double]] = {
-    f"positions in {of} (scale the mesh by {1 / factor:.6g})": _farther(factor)
-    for factor, of in (_LONGER | _SHORTER).items()
-}
+UNITS = _of_units()
