@@ -24,7 +24,7 @@ def _shares(monkeypatch, *, own, others, framed):
 def test_of_a_mesh_of_a_part_no_other_reading_of_the_poses_is_named(monkeypatch):
     """Of a figure in a room, seen closely: any rays hit a little more or less of it."""
     _shares(monkeypatch, own=0.18, others=0.21, framed=0.5)
-    with pytest.raises(InputRefused, match=r"18% of .* None of 14 usual conventions does"):
+    with pytest.raises(InputRefused, match=r"18% of .* None of 17 usual conventions does"):
         camera_checks.refuse_rays_that_miss(None, None, Path("room"))
     _shares(monkeypatch, own=0.18, others=0.21, framed=0.9)
     assert camera_checks.refuse_rays_that_miss(None, None, Path("room")) == 0.18

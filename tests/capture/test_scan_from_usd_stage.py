@@ -394,6 +394,71 @@ def test_a_camera_with_few_keys_is_where_usd_interpolates_it(tmp_path, room):
     assert_same(read_scan(tmp_path / "shot", IngestOptions()), room, poses=poses)
 
 
+@pytest.mark.parametrize(("pace", "first"), [(24, 0), (24, 1), (1, 1001), (1, 50)])
+def test_pictures_counted_one_by_one_are_those_of_the_time_samples_in_order(
+    tmp_path, room, pace, first
+):
+    """As a camera that is keyed once a second, and stills that were numbered by themselves; by
+    number they would lie between its first two keys, or nowhere."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    keys = [(pace * i, 1.4 + 0.12 * i, 10 + 36.0 * i) for i in range(10)]
+    camera = camera_with_few_keys(stage, room, keys, pace=pace * 10)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "images" / f"p{first + i:04d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room, poses=poses_at(camera, range(0, 10 * pace, pace)))
+    (told,) = (one for one in scan.warnings if "[capture.times]" in one)
+    assert "time samples of their camera in order" in told
+
+
+def test_pictures_between_keys_and_those_without_a_camera_are_told(tmp_path, room):
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    keys = (1, 1.4, 10.0), (6, 2.6, 60.0), (12, 1.5, 130.0)
+    camera_with_few_keys(stage, room, keys, pace=10)
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "images" / f"plate.{4 + i:04d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert len(scan.frames) == 9
+    (told,) = (one for one in scan.warnings if "[capture.times]" in one)
+    assert "7 of 9 pictures lie between the time samples" in told
+    assert any("1 of 10 pictures have no camera" in one for one in scan.warnings)
+
+
+def test_a_plate_that_comes_back_after_another_is_nobodys(tmp_path, room):
+    """The others stay."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    names = "abcdaefghi"
+    moving_camera(stage, room, [f"./plates/{name}.exr" for name in names])
+    stage.Save()
+    for name, image in zip(names, room.images, strict=True):
+        write_image(tmp_path / "shot" / "plates" / f"{name}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room, poses=np.delete(room.world_from_camera, (0, 4), axis=0))
+    (told,) = (one for one in scan.warnings if "[capture.duplicate]" in one)
+    assert "2 of 10 frames dropped" in told
+    assert "'a.exr' again, after another" in told
+
+
+def test_a_moving_camera_that_names_the_picture_of_one_that_stands_is_left_out(tmp_path, room):
+    """Whose number would make it the name of a sequence."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    many_cameras(stage, room)
+    for i, image in enumerate(room.images):
+        prim = stage.GetPrimAtPath(f"/shots/IMG_{i:03d}")
+        named_plate(prim).Set(Sdf.AssetPath(f"./plates/{100 + i}.exr"))
+        write_image(tmp_path / "shot" / "plates" / f"{100 + i}.exr", image)
+    moving_camera(stage, room)
+    named_plate(stage.GetPrimAtPath("/room/camera")).Set(Sdf.AssetPath("./plates/103.exr"))
+    stage.Save()
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room)
+    assert any(
+        "'/room/camera': it moves, and names pictures of /shots/" in w for w in scan.warnings
+    )
+
+
 def test_cameras_that_a_program_keeps_for_itself_are_no_lost_photographs(tmp_path, room):
     stage = make_stage(tmp_path / "shot" / "room.usda", room)
     many_cameras(stage, room)

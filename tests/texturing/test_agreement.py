@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.scenes import camera_at, edited, make_capture
+from tests.scenes import camera_at, edited, make_capture, write_ply
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.cli import main
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr, write_exr
@@ -95,6 +97,48 @@ def test_the_convention_that_fits_is_named(capture, name, capsys):
     err = capsys.readouterr().err
     assert err.endswith("[capture.convention]\n")
     assert name in err
+
+
+@pytest.mark.parametrize(
+    ("factors", "named"),
+    [
+        ((100, 100, 100), "metres and a mesh in centimetres (scale the mesh by 0.01)"),
+        ((1 / 0.3048,) * 3, "metres and a mesh in feet (scale the mesh by 0.3048)"),
+    ],
+)
+def test_a_mesh_of_another_unit_is_told(capture, factors, named, capsys):
+    """Also where frames seem to agree: most of what they show is of one colour."""
+    middle = np.array([2.0, 1.5, 1.25])
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            for row, own in zip(frame["transform_matrix"], middle, strict=False):
+                row[3] -= own
+    points = (capture.points - middle) * factors
+    write_ply(
+        capture.folder / "mesh.ply", points.astype(np.float32), capture.triangles,
+        capture.face_object,
+    )  # fmt: skip
+    assert main(["inspect", str(capture.folder)]) == 3
+    err = capsys.readouterr().err
+    assert err.endswith("[capture.convention]\n")
+    assert named in err
+    if factors[0] == 1 / 0.3048:
+        differ = float(re.search(r"\(differ by (\d+)%", err)[1]) / 100
+        assert not is_doubtful(Agreement(0.1, differ, 1000))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_beside_a_mirrored_mesh_its_cameras_see_what_they_saw(axis):
+    (mirrored,) = (
+        read for name, read in CONVENTIONS.items() if f"mirrored in {'xyz'[axis]}" in name
+    )
+    pose = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+    lens = np.array([20.0, 20, 16, 12])
+    point = np.array([[1.3, 2.2, 1.0]])
+    seen = camera_at(pose, lens, 32, 24).project(point)
+    point[:, axis] *= -1
+    camera = replace(camera_at(pose, lens, 32, 24), world_from_camera=mirrored(pose))
+    np.testing.assert_allclose(camera.project(point), seen)
 
 
 def test_poses_that_fit_under_no_reading_raise_a_doubt(capture, tmp_path, capsys):
@@ -208,7 +252,7 @@ def test_another_reading_must_be_clearly_better_good_and_see_as_much():
     others = {"a": of(0.3), "b": of(0.04, 499), "c": None, "d": of(0.1, 500)}
     assert other_convention(given, others) == "d"
     assert other_convention(None, {"b": of(0.04, 249), "d": of(0.1, 250)}) == "d"
-    for told, ratio, named in ((given, 0.53, "a"), (given, 0.55, ""), (None, 0.59, "a")):
+    for told, ratio, named in ((of(0.8), 0.59, "a"), (of(0.8), 0.61, ""), (None, 0.64, "a")):
         assert other_convention(told, {"a": of(ratio), "c": None}) == named
     assert other_convention(of(1.2), {"a": of(0.64)}) == "a"
     assert other_convention(of(1.2), {"a": of(0.66)}) == ""

@@ -47,6 +47,27 @@ def _beside_turned_meshes() -> dict[str, Callable[[Double], Double]]:
     }
 
 
+def _mirrored(axis: int) -> Callable[[Double], Double]:
+    """What the cameras of a mirrored scene would see: no pose, but as good as one to look along."""
+    mirror = np.eye(4)
+    mirror[axis, axis] = -1
+    return lambda pose: np.asarray(mirror @ pose, np.float64)
+
+
+def _beside_mirrored_meshes() -> dict[str, Callable[[Double], Double]]:
+    return {
+        f"beside a mesh mirrored in {name}, as by an exporter for left-handed axes (negate its "
+        f"{name})": _mirrored(axis)
+        for axis, name in enumerate("xyz")
+    }
+
+
+def _farther(factor: float) -> Callable[[Double], Double]:
+    """Poses in a unit so many times smaller."""
+    scale = np.array([[1, 1, 1, factor]] * 3 + [[1.0] * 4])
+    return lambda pose: np.asarray(pose * scale, np.float64)
+
+
 # Mix-ups of conventions that are tried where the poses do not fit the mesh.
 CONVENTIONS: dict[str, Callable[[Double], Double]] = {
     "OpenCV axes (negate columns 2 and 3)": opengl_from_opencv,
@@ -60,4 +81,28 @@ CONVENTIONS: dict[str, Callable[[Double], Double]] = {
     "upside down beside the mesh, as Meshroom's are (negate its y and z)": lambda m: _FLIP @ m,
     "nerfstudio's axes of 2022 (state applied_transform)": lambda m: OLD_NERFSTUDIO @ m,
     **_beside_turned_meshes(),
+    **_beside_mirrored_meshes(),
 }
+
+
+def _of_units() -> dict[str, Callable[[Double], Double]]:
+    farther = {
+        "centimetres and a mesh in millimetres": 10.0,
+        "metres and a mesh in centimetres": 100.0,
+        "metres and a mesh in millimetres": 1000.0,
+        "metres and a mesh in inches": 1 / 0.0254,
+        "metres and a mesh in feet": 1 / 0.3048,
+        "millimetres and a mesh in centimetres": 0.1,
+        "centimetres and a mesh in metres": 0.01,
+        "millimetres and a mesh in metres": 0.001,
+        "inches and a mesh in metres": 0.0254,
+        "feet and a mesh in metres": 0.3048,
+    }
+    return {
+        f"positions in {units} (scale the mesh by {1 / factor:.6g})": _farther(factor)
+        for units, factor in farther.items()
+    }
+
+
+# And of units, of which hits do not tell: from one point in a room everything is hit.
+UNITS = _of_units()

@@ -56,3 +56,9 @@ def readable_label(label: str) -> str:
     """The label as USD can store it: control characters and lone surrogates become U+FFFD."""
     encodable = label.encode("utf-8", "replace").decode("utf-8")
     return "".join("\ufffd" if unicodedata.category(c) == "Cc" else c for c in encodable)
+
+
+def number_at_end(name: str) -> int:
+    """The number that a name without suffix ends with, -1 where it ends with none."""
+    digits = re.search(r"(\d+)$", name)
+    return int(digits[1]) if digits else -1

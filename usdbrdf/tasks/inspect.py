@@ -16,9 +16,9 @@ from usdbrdf.files.frames import read_frame
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
+from usdbrdf.tasks.agreement import ASKED, agreement_of_frames
 from usdbrdf.tasks.capture_inputs import no_asset
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
-from usdbrdf.tasks.photometry import ASKED, agreement_of_frames
 from usdbrdf.tasks.turned import frames_to_compare, refuse_turned
 from usdbrdf.texturing.agreement import doubts_about_agreement, surface_and_rays
 

@@ -3,7 +3,7 @@ same points of the mesh, and how bright is each beside the others?"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,35 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from usdbrdf.capture.checks import spread_evenly
-from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.capture.native import own_faces
-from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import Read, read_frame, read_frames
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Double, Float
-from usdbrdf.model.capture import Frames, Scan
+from usdbrdf.model.capture import Scan
 from usdbrdf.model.upright import as_captured, upright
 from usdbrdf.options import AUTO, IngestOptions
+from usdbrdf.tasks.agreement import agreement_of_frames
 from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.optics import asked_of_its_optics
 from usdbrdf.tasks.poses import with_refined_poses
 from usdbrdf.tasks.task import warned
 from usdbrdf.tasks.turned import refuse_turned
 from usdbrdf.texturing.agreement import (
-    Agreement,
     MeshPoints,
-    agreement,
     doubts_about_agreement,
-    is_doubtful,
     logarithms_in_frame,
-    other_convention,
     surface_and_rays,
 )
 from usdbrdf.texturing.exposures import doubts_about_exposures, with_estimated_exposures
 from usdbrdf.transport.rays import RayScene
-
-ASKED = 16  # frames that are asked whether they agree
 
 
 def asked_of_its_pixels(
@@ -69,42 +60,6 @@ def asked_of_its_pixels(
         mesh, objects, found = segmented(scan.mesh, own_faces(scan), scan.frames, read)
         scan, told["segmentation"] = replace(scan, mesh=mesh, objects=objects), found
     return upright(scan), told
-
-
-def agreement_of_frames(
-    surface: MeshPoints, rays: RayScene, frames: Frames, read: Read, source: Path
-) -> Agreement | None:
-    """How far some frames agree; None where they see too few points in common. Of much the user
-    is to be told by ``doubts_about_agreement``.
-
-    Raises InputRefused, in the name of ``source``, where they hardly do and would under another
-    reading of the poses.
-    """
-    asked = spread_evenly(len(frames), ASKED)
-
-    def under(readings: Mapping[str, Callable[[Double], Double]]) -> dict[str, Agreement | None]:
-        found: dict[str, list[Float]] = {name: [] for name in readings}
-        images = read_frames(read, asked)
-        for i, pixels in progress(images, total=len(asked), label="agreement", unit="frames"):
-            camera = frames.camera(i)
-            for name, turned in readings.items():
-                other = replace(camera, world_from_camera=turned(camera.world_from_camera))
-                found[name].append(logarithms_in_frame(surface, rays, other, pixels))
-        return {name: agreement(np.stack(some, axis=1)) for name, some in found.items()}
-
-    given = under({"": lambda pose: pose})[""]
-    if not is_doubtful(given):
-        return given
-    found = under(CONVENTIONS)
-    better = found.get(name := other_convention(given, found))
-    if better is not None:
-        differ = f"differ by {given.ratio:.0%} of what any two pixels do" if given else "share none"
-        raise InputRefused(
-            f"{source}: the frames do not show the same things at the same points of the mesh "
-            f"({differ}); with the poses read as {name} they would differ by {better.ratio:.0%}. "
-            "Convert the poses. [capture.convention]"
-        )
-    return given
 
 
 def estimated_exposures(

@@ -38,6 +38,10 @@ class MeshPoints(NamedTuple):
     normal: Double
     owner: Int
 
+    def every(self, step: int) -> MeshPoints:
+        """One of so many."""
+        return MeshPoints(self.point[::step], self.normal[::step], self.owner[::step])
+
 
 def points_of_surface(mesh: ScanMesh, count: int = _POINTS) -> MeshPoints:
     """``count`` points, even by area, the same for equal meshes."""

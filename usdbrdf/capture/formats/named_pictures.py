@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -27,6 +26,7 @@ from usdbrdf.capture.parts import (
 from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
+from usdbrdf.files.naming import number_at_end
 from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
@@ -155,9 +155,8 @@ class Pictures:
         one number the one that is nearer to radiance."""
         found: dict[int, list[Path]] = {}
         for path in self.paths:
-            if digits := re.search(r"(\d+)$", path.stem):
-                found.setdefault(int(digits.group(1)), []).insert(0, path)
-        return {i: _nearest(alike)[0] for i, alike in found.items()}
+            found.setdefault(number_at_end(path.stem), []).insert(0, path)
+        return {i: _nearest(alike)[0] for i, alike in sorted(found.items()) if i >= 0}
 
 
 def _composed(name: str) -> str:

@@ -27,11 +27,12 @@ from usdbrdf.capture.formats.named_pictures import (
     refuse_without_pictures,
     scan_of,
     warn_of_radiance,
+    warn_of_unused,
 )
 from usdbrdf.capture.parts import geometry_from_file, geometry_from_usd
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
-from usdbrdf.files.naming import identifier_from
+from usdbrdf.files.naming import identifier_from, number_at_end
 from usdbrdf.files.tables import files_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -125,6 +126,8 @@ def _records(
         pictures = pictures_of(stage.parent, options)
         refuse_without_pictures(pictures, stage)
         named = _by_name(shots, pictures)
+        _warn_of_times(named, findings, stage)
+        warn_of_unused(pictures, (p for _, p in named if p), findings, stage)
         warn_of_radiance(pictures.instead, findings, stage)
         if not any(image for _, image in named):
             first = min(pictures.paths).name
@@ -160,15 +163,32 @@ def _records(
 
 def _with_places(shots: list[_Shot], findings: Findings) -> list[_Shot]:
     """The shots, without those of cameras that name one picture for many times, of which nobody
-    knows the one that it was taken at."""
-    of_all: dict[str, int] = {}
-    for shot in shots:
-        files = [image for image in shot.camera.images if image]
+    knows the one that it was taken at, or one of another camera, which stands still; and without
+    those whose picture their camera names again, after another."""
+    stills = {s.camera.images[0]: s.camera.path for s in shots if math.isnan(s.time)}
+    why: dict[str, str] = {}
+    again: set[tuple[str, str]] = set()
+    for path, camera in {shot.camera.path: shot.camera for shot in shots}.items():
+        files = [image for image in camera.images if image]
+        if math.isnan(camera.times[0]) or not files:
+            continue
         if len(files) > 1 and len({*files}) == 1:
-            of_all[shot.camera.path] = len(files)
-    for path, number in of_all.items():
-        findings.drop(path, f"it names one picture for {number} times", "capture.duplicate")
-    return [shot for shot in shots if shot.camera.path not in of_all]
+            why[path] = f"it names one picture for {len(files)} times"
+        elif other := next((stills[file] for file in files if file in stills), ""):
+            why[path] = f"it moves, and names pictures of {other}, which does not"
+        else:
+            again |= {(path, file) for file, count in Counter(files).items() if count > 1}
+    for path, said in why.items():
+        findings.drop(path, said, "capture.duplicate")
+    kept = []
+    for shot in shots:
+        image = shot.camera.images[shot.i]
+        if (shot.camera.path, image) in again:
+            said = f"its camera names {Path(image).name!r} again, after another"
+            findings.drop(shot.name, said, "capture.duplicate")
+        elif shot.camera.path not in why:
+            kept.append(shot)
+    return kept
 
 
 def _others(cameras: set[str], pictured: set[str]) -> set[str]:
@@ -220,7 +240,7 @@ def _found(
         for identifier in _identifiers(path.stem):
             by_identifier.setdefault(identifier, []).append(path)
     alone = len({shot.camera.path for shot in shots}) == 1
-    numbered: dict[str, dict[int, Path]] = {}
+    numbered: dict[str, dict[float, Path]] = {}
 
     def found(shot: _Shot, first: str, names: tuple[str, ...]) -> Path | None:
         if math.isnan(shot.time):
@@ -230,11 +250,48 @@ def _found(
             starts = re.compile(rf"{first}\D?\d+")
             own = (p for p in pictures.paths if p.parent.name == first or starts.fullmatch(p.stem))
             paths = pictures.paths if alone else tuple(own)
-            numbered[first] = Pictures(folder=pictures.folder, paths=paths).numbered()
-        return numbered[first].get(round(shot.time)) if shot.time == round(shot.time) else None
+            found = Pictures(folder=pictures.folder, paths=paths).numbered()
+            numbered[first] = _by_time(found, shot.camera)
+        return numbered[first].get(shot.time)
 
     named = zip(shots, names_of_shots, strict=True)
     return [found(shot, names[0], names) if names else None for shot, names in named]
+
+
+def _by_time(numbered: dict[int, Path], camera: UsdCamera) -> dict[float, Path]:
+    """Pictures by the times that they were taken at: their numbers, unless they are as many as the
+    camera's time samples and counted one by one, as these are not, or elsewhere: in order then."""
+    times = camera.times[camera.sampled]
+    first, count = min(numbered, default=0), len(numbered)
+    counted = count == len(times) and [*numbered] == [*range(first, first + count)]
+    if counted and (np.any(np.diff(times) != 1) or not numbered.keys() & {*times.tolist()}):
+        return dict(zip(times.tolist(), numbered.values(), strict=True))
+    return {float(number): path for number, path in numbered.items()}
+
+
+def _warn_of_times(
+    named: list[tuple[_Shot, Path | None]], findings: Findings, source: Path
+) -> None:
+    """One sentence each on pictures that are taken for time samples of other numbers, and on those
+    between time samples."""
+    there = [(shot, image) for shot, image in named if image and not math.isnan(shot.time)]
+    others = [(shot, image) for shot, image in there if number_at_end(image.stem) != shot.time]
+    if others:
+        shot, image = others[0]
+        findings.warn(
+            f"{source.name}: {len(others)} pictures are taken for the time samples of their camera "
+            f"in order, as they are as many, but numbered otherwise, first {image.name!r} for "
+            f"{shot.name}. Give them the numbers of their time samples if that is wrong. "
+            "[capture.times]"
+        )
+    between = [(shot, image) for shot, image in there if not shot.sampled]
+    if between:
+        shot, image = between[0]
+        findings.warn(
+            f"{source.name}: {len(between)} of {len(there)} pictures lie between the time samples "
+            f"of their camera, which is interpolated, first {image.name!r} for {shot.name}. Give "
+            "them the numbers of their time samples if they were taken at these. [capture.times]"
+        )
 
 
 def _identifiers(stem: str) -> set[str]:

@@ -1,0 +1,82 @@
+"""Whether the frames of a scan show the same things at the same points of its mesh, under its poses
+as they are given or under another reading of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.capture.conventions import CONVENTIONS, UNITS
+from usdbrdf.errors import InputRefused
+from usdbrdf.files.frames import Read, read_frames
+from usdbrdf.job.progress import progress
+from usdbrdf.model.arrays import Double, Float
+from usdbrdf.model.capture import Frames
+from usdbrdf.texturing.agreement import (
+    Agreement,
+    MeshPoints,
+    agreement,
+    is_doubtful,
+    logarithms_in_frame,
+    other_convention,
+)
+from usdbrdf.transport.rays import RayScene
+
+ASKED = 16  # frames that are asked whether they agree
+_AS_GIVEN = ""
+_READINGS: dict[str, Callable[[Double], Double]] = {
+    _AS_GIVEN: lambda pose: pose,
+    **CONVENTIONS,
+    **UNITS,
+}
+# Of the points every so many are looked up under other readings at first.
+_STRIDE = 4
+
+
+def agreement_of_frames(
+    surface: MeshPoints, rays: RayScene, frames: Frames, read: Read, source: Path
+) -> Agreement | None:
+    """How far some frames agree; None where they see too few points in common. Of much the user
+    is to be told by ``doubts_about_agreement``.
+
+    Raises InputRefused, in the name of ``source``, where they hardly do and would under another
+    reading of the poses.
+    """
+    asked = spread_evenly(len(frames), ASKED)
+
+    def looked_up(steps: Mapping[str, int]) -> dict[str, Float]:
+        """What the frames show, under some readings, at every so many points."""
+        some = {step: surface.every(step) for step in steps.values()}
+        found: dict[str, list[Float]] = {name: [] for name in steps}
+        images = read_frames(read, asked)
+        for i, pixels in progress(images, total=len(asked), label="agreement", unit="frames"):
+            camera = frames.camera(i)
+            for name, step in steps.items():
+                pose = _READINGS[name](camera.world_from_camera)
+                other = replace(camera, world_from_camera=pose)
+                found[name].append(logarithms_in_frame(some[step], rays, other, pixels))
+        return {name: np.stack(columns, axis=1) for name, columns in found.items()}
+
+    # Under wrong readings frames may agree as well, where most of a scene is one colour; but less.
+    shown = looked_up(dict.fromkeys(_READINGS, _STRIDE) | {_AS_GIVEN: 1})
+    given = agreement(shown[_AS_GIVEN])
+    shown[_AS_GIVEN] = shown[_AS_GIVEN][::_STRIDE]
+    found = {name: agreement(rows) for name, rows in shown.items()}
+    told = found.pop(_AS_GIVEN)
+    if told and not is_doubtful(given) and not other_convention(told, found):
+        return given
+    every = {name: 1 for name in _READINGS if name != _AS_GIVEN}
+    found = {name: agreement(rows) for name, rows in looked_up(every).items()}
+    better = found.get(name := other_convention(given, found))
+    if better is not None:
+        differ = f"differ by {given.ratio:.0%} of what any two pixels do" if given else "share none"
+        raise InputRefused(
+            f"{source}: the frames do not show the same things at the same points of the mesh "
+            f"({differ}); with the poses read as {name} they would differ by {better.ratio:.0%}. "
+            "Convert the poses. [capture.convention]"
+        )
+    return given
