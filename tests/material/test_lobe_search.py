@@ -87,6 +87,40 @@ def test_what_is_there_is_found_between_the_roughnesses_that_are_always_tried(ph
     assert found.of_rays == pytest.approx((0, 0), abs=1e-6)
 
 
+def test_variances_follow_from_the_best_lobe_of_the_third_basis():
+    """Of the roughnesses that are always tried; its light is what ``ViewModel.update`` asks for."""
+
+    class Heard(Even):
+        def update(self, non_diffuse: Any) -> None:
+            self.heard = non_diffuse
+
+    exact, third, model = shown(0.0, 0), shown(0.5, 3), Heard()
+    base, slope = exact([0.25])
+    fit = _Fit(Candidate(exact, exact, third, 0.0), model, (base + PSI * slope)[..., 0])  # type: ignore[arg-type]
+    fit.improve()
+    base, slope = third([0.25])
+    np.testing.assert_allclose(model.heard, (base + PSI * slope)[..., 0], rtol=1e-4)
+
+
+@pytest.mark.parametrize(("phi", "count"), [(0.0, 3), (0.25, 6), (1.0, 3)])
+def test_the_search_goes_on_on_either_side_of_the_best_alone(phi: float, count: int):
+    asked: list[Sequence[float]] = []
+
+    def at(phis: Sequence[float]) -> tuple[Any, Any]:
+        asked.append(phis)
+        return shown(0.0, 0)(phis)
+
+    base, slope = at([phi])
+    fit = _Fit(Candidate(at, at, at, 0.0), Even(), (base + PSI * slope)[..., 0])  # type: ignore[arg-type]
+    fit.estimate(fit.coarse(), 1.0, 1)
+    _, tried, _, closer, _ = asked
+    assert len(closer) == count
+    assert not set(closer) & set(tried)
+    nearest = [min(tried, key=lambda one, phi=other: abs(one - phi)) for other in closer]
+    beside = sorted(tried, key=lambda one: abs(one - phi))[: 1 + count // 3]
+    assert set(nearest) <= set(beside)
+
+
 @pytest.mark.parametrize(("phi", "near"), [(0.0, (0.0, 0.0, 0.0025)), (1.0, (0.975, 1.0, 1.0))])
 def test_at_either_end_there_is_one_neighbour(monkeypatch, phi: float, near: tuple[float, ...]):
     asked = []
