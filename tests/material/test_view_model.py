@@ -10,7 +10,7 @@ import pytest
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 
 FIRST_GUESS, INDEPENDENT, OF_SPECULAR = 0.02, 0.012, 0.25
-CELL = 0.1
+CELL, FREEDOM_OF_STUDENT = 0.1, 15
 
 
 def _samples(
@@ -176,6 +176,23 @@ def test_the_samples_tell_how_large_their_errors_are():
     # With the right covariance each degree of freedom costs about one.
     whole = samples.radiance
     assert _found(model, whole, whole) / model.degrees_of_freedom == pytest.approx(1, abs=0.2)
+
+
+@pytest.mark.parametrize("own", [0.01, 0.06])
+def test_what_all_channels_of_a_sample_share_is_told_from_what_they_do_not(own: float):
+    """Where no frame shows two texels, each sample has an error of its own, of all channels alike,
+    and one of each channel, which is as large as it was said to be."""
+    rng, count = np.random.default_rng(5), 60 * 20
+    samples = replace(_samples(rng, 60, 20, area=100.0), frame=np.arange(count))
+    error = own * rng.standard_normal((count, 1)) + INDEPENDENT * rng.standard_normal((count, 3))
+    # Of Student's distribution, as the model has it.
+    error /= np.sqrt(rng.chisquare(FREEDOM_OF_STUDENT, (count, 1)) / FREEDOM_OF_STUDENT)
+    samples = replace(samples, radiance=(samples.radiance * (1 + error)).astype(np.float32))
+    model = ViewModel(samples)
+    for _ in range(30):
+        model.update(np.zeros((count, 3)))
+    assert model._own_deviation == pytest.approx(own, rel=0.08)
+    assert model._scale == pytest.approx(1, rel=0.1)
 
 
 def _shared_errors(model: ViewModel) -> int:
