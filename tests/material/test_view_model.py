@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from usdbrdf.material.view_model import ViewModel, ViewSamples
+from usdbrdf.material.view_model import ViewModel, ViewSamples, _effects
 
 FIRST_GUESS, INDEPENDENT, OF_SPECULAR = 0.02, 0.012, 0.25
 CELL, FREEDOM_OF_STUDENT = 0.1, 15
@@ -220,6 +220,29 @@ def test_more_frames_than_shared_errors_are_wanted_come_to_an_end():
     few = _samples(np.random.default_rng(6), 3, 300)
     model = ViewModel(few)
     assert model.degrees_of_freedom > 0
+
+
+@pytest.mark.parametrize("along", [(1, 0, 0), (1, 1, 1), (0, 0.1, 1)])
+def test_cells_grow_until_their_errors_are_few_enough_however_the_object_lies(
+    along: tuple[float, float, float],
+):
+    """50 frames of 60 places in a row ten metres away: more than 2500 small cells of a metre's
+    thousandth, and no more than 2500 errors in all once cells hold several places each."""
+    texel, frame = (a.ravel() for a in np.mgrid[0:60, 0:50])
+    row = np.linspace(0, 1, 60)[:, None] * np.array(along)
+    samples = ViewSamples(
+        texel=texel,
+        frame=frame,
+        position=np.float32(10 + row)[texel],
+        radiance=np.ones((3000, 3), np.float32),
+        noise=np.ones((3000, 3), np.float32),
+        cell=0.02,
+    )
+    every = _effects(samples)
+    number = sum(int(which.max(initial=-1)) + 1 for which, _ in every)
+    # Nine for each frame if cells are as large as all of it, which they need not be here.
+    assert 9 * 50 < number <= 2500
+    assert [channel for _, channel in every] == [None, None, None, 0, 1, 2, 0, 1, 2]
 
 
 def test_what_no_lobe_explains_is_told_beside_what_one_does():

@@ -130,6 +130,14 @@ def test_nothing_is_an_opening_under_the_open_sky_or_in_the_dark(world: World) -
     assert not len(_lights(ground, ground.per_object([(0.1, 0.1, 0.1)] * 2), flat).face)
 
 
+def test_where_nothing_opens_there_is_none_of_anything(world: World) -> None:
+    dark = np.zeros(len(world.scene.triangles))
+    found = openings_of(world.scene, world.texels, world.rays, dark, black_environment())
+    assert len(found.corners) == len(found.area) == len(found.weight) == 0
+    assert found.arriving == 0
+    assert not found.box.any()
+
+
 def test_a_ray_leaves_through_the_triangle_that_it_crosses() -> None:
     box = np.array([[-1.0, -2, 0], [0.5, 0.25, 1], [4, 16, 3]])
     corners = _corners_of(box)
