@@ -73,8 +73,9 @@ def test_densities_of_a_tile_integrate_to_one():
     assert np.abs(ratio[0] - ratio[1]).max() > 1  # the two tiles favour different lights
 
 
-def test_picks_follow_the_density_and_leave_a_uniform_number():
-    lights = _soup(300)
+@pytest.mark.parametrize("number", [1, 5, 300])
+def test_picks_follow_the_density_and_leave_a_uniform_number(number: int):
+    lights = _soup(number)
     groups = lights.groups
     tiles = _weighed(groups)
     ratio, count = tiles.ratio, 1 << 16
@@ -89,13 +90,13 @@ def test_picks_follow_the_density_and_leave_a_uniform_number():
     pick_triangles(receivers, 0, 0, even, Picked(chosen, favour, left, left))
     power = np.diff(groups.cumulative, prepend=0)
     expected = power * ratio[0, groups.triangles[:, GROUP].astype(int)]
-    np.testing.assert_allclose(np.bincount(chosen, minlength=300) / count, expected, atol=3e-5)
+    np.testing.assert_allclose(np.bincount(chosen, minlength=number) / count, expected, atol=3e-5)
     np.testing.assert_array_equal(favour, ratio[0, groups.triangles[chosen, GROUP].astype(int)])
     assert left.min() >= 0
     assert left.max() < 1
     np.testing.assert_allclose(np.histogram(left, 8, (0, 1))[0] / count, 1 / 8, atol=5e-3)
     # And so for each light alone, the first one too: even numbers leave even ones.
-    for light in np.flatnonzero(np.bincount(chosen, minlength=300) >= 20):
+    for light in np.flatnonzero(np.bincount(chosen, minlength=number) >= 20):
         own = np.sort(left[chosen == light])
         evenly = (np.arange(len(own)) + 0.5) / len(own)
         np.testing.assert_allclose(own, evenly, atol=1.01 / len(own) + 1e-3)
