@@ -39,6 +39,18 @@ def test_pickles_and_damage_are_refused(tmp_path):
         load_arrays(tmp_path / "none.npz")
 
 
+@pytest.mark.parametrize("version", [(1, 0), (2, 0), (3, 0)])
+def test_arrays_are_read_in_any_of_numpy_s_formats(tmp_path, version):
+    """Headers of the second have a length of four bytes, those of the third may hold any name."""
+    kind = np.float32 if version < (3, 0) else np.dtype([("höhe", np.float32)])
+    values = np.arange(12, dtype=np.float32).view(kind).reshape(3, 4)
+    with (tmp_path / "x.npy").open("wb") as file:
+        np.lib.format.write_array(file, values, version)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.write(tmp_path / "x.npy", "x.npy")
+    np.testing.assert_array_equal(load_arrays(tmp_path / "a.npz")["x"], values)
+
+
 @pytest.mark.fault("S7")
 @pytest.mark.parametrize(
     "header",

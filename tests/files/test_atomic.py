@@ -23,6 +23,7 @@ from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files import atomic
 from usdbrdf.files.atomic import (
     environment_failures,
+    failure_of_machine,
     flush_folder,
     publish,
     sha256_of,
@@ -410,3 +411,20 @@ def test_flushing_a_folder_leaves_nothing_open(tmp_path):
     before = len(os.listdir("/proc/self/fd"))
     atomic.flush_folder(tmp_path)
     assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_only_errors_of_permission_disk_files_and_threads_are_the_machine_s():
+    for number in (errno.EACCES, errno.ENOSPC, errno.EMFILE, errno.EIO):
+        found = failure_of_machine(OSError(number, os.strerror(number), "room/a.exr"))
+        assert isinstance(found, EnvironmentFailure)
+        assert str(found).startswith(f"room/a.exr: {os.strerror(number)}")
+    assert isinstance(
+        failure_of_machine(RuntimeError("can't start new thread")), EnvironmentFailure
+    )
+    for defect in (
+        OSError(errno.ENOENT, "none"),
+        OSError("odd"),
+        ValueError("x"),
+        RuntimeError("y"),
+    ):
+        assert failure_of_machine(defect) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from usdbrdf.files.frames import (
     photograph_limits,
     read_frame,
     read_frames,
+    transmission,
     transparent_of,
 )
 from usdbrdf.model.capture import Frames
@@ -173,6 +175,26 @@ def test_linear_images_keep_their_values_whatever_their_saturation(tmp_path):
     _write(tmp_path / "a.exr", pixels, "float")
     frame = read_frame(_frames(tmp_path / "a.exr", saturation_radiance=3.0), 0)
     np.testing.assert_array_equal(frame.radiance, pixels)
+
+
+def test_what_a_lens_keeps_back_is_put_back_by_the_distance_from_its_own_middle(tmp_path):
+    """ln V = k1 rho^2 + k2 rho^4, rho in half diagonals of the picture: 7 x 5 pixels here, whose
+    principal point lies a pixel right of the middle and one above it."""
+    _write(tmp_path / "a.exr", np.full((5, 7, 3), 2.0, np.float32), "float")
+    frames = replace(
+        _frames(tmp_path / "a.exr", saturation_radiance=1e3),
+        intrinsics=np.array([[5.0, 5, 4.5, 1.5]]),
+        resolution=np.array([[7, 5]], np.int32),
+        vignetting=(-0.5, -0.3),
+    )
+    y, x = np.mgrid[:5, :7]
+    square = ((x - 4) ** 2 + (y - 1) ** 2) / (3.5**2 + 2.5**2)
+    wanted = np.exp(-0.5 * square - 0.3 * square**2)
+    assert wanted[1, 4] == 1
+    np.testing.assert_allclose(transmission(frames, 0), wanted, rtol=1e-6)
+    found = read_frame(frames, 0)
+    np.testing.assert_allclose(found.radiance, 2 / np.repeat(wanted[..., None], 3, 2), rtol=1e-6)
+    assert found.valid.all()
 
 
 def test_photograph_limits_are_linear_values():

@@ -17,6 +17,7 @@ from tests.fault_injection import run_watched
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files import images
 from usdbrdf.files.images import (
+    _check_limits,
     encoded_jpeg,
     image_size,
     kind_of_colours,
@@ -613,6 +614,22 @@ def test_six_damaged_bytes_give_pixels_or_a_refusal(tmp_path, radiance, compress
         except ImageRefused:
             refused += 1
     assert refused > (20 if compression != "none" else 0), "a byte of the header at least"
+
+
+@pytest.mark.fault("I12")
+@pytest.mark.parametrize(("height", "limited"), [(5000, False), (6500, True)])
+def test_from_a_gibibyte_on_no_byte_may_stand_for_ten_thousand(tmp_path, height, limited):
+    """12 bytes a pixel, 16384 a row: 5461 rows are one."""
+    spec, most = oiio.ImageSpec(16384, height, 3, "float"), 10_000
+    spec.full_width, spec.full_height = spec.width, spec.height
+    declared = 12 * spec.width * height
+    _check_limits(tmp_path / "a.exr", spec, declared // (most - 1), 65_536)
+    for size in (declared // (most + 1), 1000):
+        if limited:
+            with pytest.raises(ImageRefused, match=r"times as many.+\[image\.limits\]$"):
+                _check_limits(tmp_path / "a.exr", spec, size, 65_536)
+        else:
+            _check_limits(tmp_path / "a.exr", spec, size, 65_536)
 
 
 @pytest.mark.fault("I12")

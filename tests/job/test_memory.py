@@ -40,6 +40,7 @@ V1 = "11:cpu,cpuacct:/batch\n7:memory:/batch/job\n0::/\n"
         ("0::/\n", {"memory.max": str(1 << 29)}, 1 << 29),
         ("0::/batch/job\n", {"batch/job/memory.max": "4096", "memory.max": "max"}, 4096),
         ("0::/batch/job\n", {"batch/job/memory.max": "max", "batch/memory.max": "8192"}, 8192),
+        ("0::/kube:pod:1\n", {"kube:pod:1/memory.max": "4096", "memory.max": "max"}, 4096),
         ("0::/docker/of-the-host\n", {"memory.max": "4096"}, 4096),
         (V1, {"memory/batch/job/memory.limit_in_bytes": "4096"}, 4096),
         (V1, {"memory/memory.limit_in_bytes": "4096", "memory.max": "max"}, 4096),

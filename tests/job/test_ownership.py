@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import re
@@ -173,6 +175,25 @@ def test_what_was_not_there_before_a_failure_is_not_there_after_it(tmp_path):
     own(tmp_path / "empty")
     fail_in(tmp_path / "empty")
     assert (tmp_path / "empty/.usdbrdf/job.json").is_file()
+
+
+@pytest.mark.fault("R6")
+def test_a_run_that_finds_no_locks_takes_away_what_it_made_alone(tmp_path, monkeypatch):
+    state = own(tmp_path / "old")
+    (tmp_path / "empty").mkdir()
+
+    def no_locks(*_arguments):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    before = names_in(tmp_path)
+    monkeypatch.setattr(fcntl, "lockf", no_locks)
+    for name in ("old", "empty", "new/room"):
+        with pytest.raises(FolderBusy, match=r"\[lock\.none\]$"):
+            own(tmp_path / name)
+        assert names_in(tmp_path) == before, name
+    assert json.loads((state / "job.json").read_text())["tool"] == "usdbrdf"
+    with owned_folder(tmp_path / "new/room", without_lock=True) as state:
+        assert state == tmp_path / "new/room/.usdbrdf"
 
 
 def test_folders_that_hold_something_else_by_then_stay(tmp_path):

@@ -73,6 +73,50 @@ def test_a_metal_is_found_with_its_colour():
     assert metal.f0_error < 0.05
 
 
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_the_unit_of_radiance_plays_no_part(unit: float):
+    """Though texels that next to no light comes to count as if they showed a thousandth of the
+    usual."""
+    dark = np.where(TEXEL < 3, 1e-5, 1.0)[:, None]
+    radiance = ((0.01 + F0) * _incident(1) * dark).astype(np.float32)
+    light = np.full((len(TEXEL), 3), 1.5, np.float32)
+    dielectric = LobeEstimate(PHI, 1.0, 0.02, 0.1, 0.0, 1.0, 0.9)
+
+    def found(unit: float):
+        def basis(seed: int) -> Any:
+            lit = np.float32(unit * dark)[..., None]
+            return lambda phis: tuple(one * lit for one in _basis(seed)(phis))
+
+        samples = (radiance * np.float32(unit), TEXEL, light * np.float32(unit))
+        return conductor_of(*samples, (basis(2), basis(3)), dielectric, certain=True)
+
+    usual, other = found(1.0), found(unit)
+    assert other.phi == usual.phi
+    np.testing.assert_allclose(other.f0, usual.f0, rtol=1e-4)
+    np.testing.assert_allclose(usual.f0, F0, atol=0.1)
+
+
+def test_to_see_everything_twice_tells_of_the_same_metal():
+    """What is far off, as glare is, is cut back by what a texel shows, not by how often it does."""
+    rng = np.random.default_rng(4)
+    glare = np.where(rng.random((len(TEXEL), 1)) < 0.05, 6.0, 1.0)
+    radiance = ((0.01 + F0) * _incident(1) * glare).astype(np.float32)
+    light = np.full((len(TEXEL), 3), 1.5, np.float32)
+    dielectric = LobeEstimate(PHI, 1.0, 0.02, 0.1, 0.0, 1.0, 0.9)
+
+    def found(times: int):
+        def basis(seed: int) -> Any:
+            return lambda phis: tuple(np.tile(one, (times, 1, 1)) for one in _basis(seed)(phis))
+
+        samples = (np.tile(radiance, (times, 1)), np.tile(TEXEL, times), np.tile(light, (times, 1)))
+        return conductor_of(*samples, (basis(2), basis(3)), dielectric, certain=True)
+
+    once, twice = found(1), found(2)
+    assert twice.phi == once.phi == PHI
+    np.testing.assert_allclose(twice.f0, once.f0, rtol=1e-5)
+    np.testing.assert_allclose(once.f0, F0, atol=0.1)
+
+
 def test_the_roughest_metal_is_told_by_nobody_but_a_person():
     rough = (0.01 + F0) * _incident(1)
     assert _found(rough, 1.0, phi=0.46) is not None

@@ -154,6 +154,17 @@ def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
         assert found.phi_confidence == confidence
 
 
+@pytest.mark.parametrize("phi", [0.0, 0.01, 0.04])
+def test_of_a_mirror_the_footprint_counts_as_against_a_hundredth_of_a_radian(phi: float):
+    def of_psi(unresolved: float) -> float:
+        found = verdict_on_views(_lobe(phi=phi, psi_error=0.0, unresolved=unresolved), True)
+        return found.psi_error
+
+    assert of_psi(0.0) == 0
+    for share in (0.2, 0.5, 1.0):
+        assert of_psi(share * max(phi, 0.01)) == pytest.approx(share * of_psi(1.0))
+
+
 @pytest.mark.parametrize("share", [0.45, 0.55])
 def test_a_lobe_within_twice_its_error_of_none_is_no_measurement(share: float):
     # In a stairwell by others a lobe of 0.5 came out as 0.04 +- 0.03.

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from usdbrdf.material.view_model import ViewModel, ViewSamples
+from usdbrdf.material.view_model import ViewModel, ViewSamples, _effects
 
 FIRST_GUESS, INDEPENDENT, OF_SPECULAR = 0.02, 0.012, 0.25
-CELL = 0.1
+CELL, FREEDOM_OF_STUDENT = 0.1, 15
 
 
 def _samples(
@@ -178,6 +178,23 @@ def test_the_samples_tell_how_large_their_errors_are():
     assert _found(model, whole, whole) / model.degrees_of_freedom == pytest.approx(1, abs=0.2)
 
 
+@pytest.mark.parametrize("own", [0.01, 0.06])
+def test_what_all_channels_of_a_sample_share_is_told_from_what_they_do_not(own: float):
+    """Where no frame shows two texels, each sample has an error of its own, of all channels alike,
+    and one of each channel, which is as large as it was said to be."""
+    rng, count = np.random.default_rng(5), 60 * 20
+    samples = replace(_samples(rng, 60, 20, area=100.0), frame=np.arange(count))
+    error = own * rng.standard_normal((count, 1)) + INDEPENDENT * rng.standard_normal((count, 3))
+    # Of Student's distribution, as the model has it.
+    error /= np.sqrt(rng.chisquare(FREEDOM_OF_STUDENT, (count, 1)) / FREEDOM_OF_STUDENT)
+    samples = replace(samples, radiance=(samples.radiance * (1 + error)).astype(np.float32))
+    model = ViewModel(samples)
+    for _ in range(30):
+        model.update(np.zeros((count, 3)))
+    assert model._own_deviation == pytest.approx(own, rel=0.08)
+    assert model._scale == pytest.approx(1, rel=0.1)
+
+
 def _shared_errors(model: ViewModel) -> int:
     return sum(len(frame.kind) for frame in model._effects)
 
@@ -203,6 +220,29 @@ def test_more_frames_than_shared_errors_are_wanted_come_to_an_end():
     few = _samples(np.random.default_rng(6), 3, 300)
     model = ViewModel(few)
     assert model.degrees_of_freedom > 0
+
+
+@pytest.mark.parametrize("along", [(1, 0, 0), (1, 1, 1), (0, 0.1, 1)])
+def test_cells_grow_until_their_errors_are_few_enough_however_the_object_lies(
+    along: tuple[float, float, float],
+):
+    """50 frames of 60 places in a row ten metres away: more than 2500 small cells of a metre's
+    thousandth, and no more than 2500 errors in all once cells hold several places each."""
+    texel, frame = (a.ravel() for a in np.mgrid[0:60, 0:50])
+    row = np.linspace(0, 1, 60)[:, None] * np.array(along)
+    samples = ViewSamples(
+        texel=texel,
+        frame=frame,
+        position=np.float32(10 + row)[texel],
+        radiance=np.ones((3000, 3), np.float32),
+        noise=np.ones((3000, 3), np.float32),
+        cell=0.02,
+    )
+    every = _effects(samples)
+    number = sum(int(which.max(initial=-1)) + 1 for which, _ in every)
+    # Nine for each frame if cells are as large as all of it, which they need not be here.
+    assert 9 * 50 < number <= 2500
+    assert [channel for _, channel in every] == [None, None, None, 0, 1, 2, 0, 1, 2]
 
 
 def test_what_no_lobe_explains_is_told_beside_what_one_does():

@@ -3,6 +3,8 @@ noise, and nowhere else."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -11,10 +13,11 @@ from usdbrdf.options import Sampling
 from usdbrdf.transport.brdf import DIELECTRIC
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import irradiance_at
-from usdbrdf.transport.lights import Lights, lights_from_radiance
+from usdbrdf.transport.lights import GROUP, Lights, lights_from_radiance, weighed_groups
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.openings import _corners_of, opening_at, openings_of
+from usdbrdf.transport.sampling_loops import PointDraws, Receivers, weight_of_opening
 from usdbrdf.transport.tile_draws import independent_tiles
 
 # A room of 4 x 4 x 3 m whose wall at x = 4 has a window of 1 x 1 m in its middle.
@@ -130,6 +133,14 @@ def test_nothing_is_an_opening_under_the_open_sky_or_in_the_dark(world: World) -
     assert not len(_lights(ground, ground.per_object([(0.1, 0.1, 0.1)] * 2), flat).face)
 
 
+def test_where_nothing_opens_there_is_none_of_anything(world: World) -> None:
+    dark = np.zeros(len(world.scene.triangles))
+    found = openings_of(world.scene, world.texels, world.rays, dark, black_environment())
+    assert len(found.corners) == len(found.area) == len(found.weight) == 0
+    assert found.arriving == 0
+    assert not found.box.any()
+
+
 def test_a_ray_leaves_through_the_triangle_that_it_crosses() -> None:
     box = np.array([[-1.0, -2, 0], [0.5, 0.25, 1], [4, 16, 3]])
     corners = _corners_of(box)
@@ -145,6 +156,46 @@ def test_a_ray_leaves_through_the_triangle_that_it_crosses() -> None:
         normal = np.cross(b - a, c - a)
         assert normal @ w < 0
         np.testing.assert_allclose(normal @ (x + far * w - a), 0, atol=1e-9)
+
+
+def test_a_ray_that_leaves_is_weighed_against_those_that_are_sent_to_where_it_does(
+    world: World,
+) -> None:
+    """By the balance heuristic: cos / (p_cosine + p_light), both per solid angle; pi where none
+    could have been sent."""
+    sky = Environment(np.ones((4, 8, 3), np.float32), z_up=True)
+    lights = _lights(world, world.per_object([(0.1, 0.1, 0.1)] * 9), sky)
+    groups, (position, normal) = lights.groups, _receivers()
+    count = len(position)
+    picks = weighed_groups(groups, position, normal, np.array([0, count]))
+    bits = np.zeros((0, 4), np.uint32)
+    receivers = Receivers(
+        position, normal, PointDraws(bits, bits, 0, np.zeros(0, np.int64)), groups,
+        np.zeros(count, np.int32), picks, np.zeros((0, 0), np.float32), np.zeros(0, np.int32),
+    )  # fmt: skip
+    rng = np.random.default_rng(11)
+    through = np.stack([np.full(count, 4.0), *rng.uniform((1.5, _LOW), (2.5, _HIGH), (count, 2)).T])
+    towards = through.T - position
+    towards = (towards / np.linalg.norm(towards, axis=1, keepdims=True)).astype(np.float32)
+    weighed = 0
+    for k in range(count):
+        triangle, far = opening_at(lights.box, *position[k], *towards[k])
+        number = np.flatnonzero(lights.face == lights.first_opening + triangle)
+        cosine = float(normal[k] @ towards[k])
+        found = weight_of_opening(receivers, k, towards, k)
+        if not len(number):
+            assert found == pytest.approx(math.pi)
+            continue
+        (a, b, c), weighed = lights.corners[number[0]].astype(float), weighed + 1
+        across = np.cross(b - a, c - a)
+        sent = -(across @ towards[k]) / np.linalg.norm(across)
+        group = int(groups.triangles[groups.of_face[lights.first_opening + triangle], GROUP])
+        density = lights.density[lights.first_opening + triangle] * picks.ratio[0, group]  # by area
+        wanted = cosine / (cosine / math.pi + density * far**2 / sent)
+        assert found == pytest.approx(wanted, rel=1e-4)
+    assert weighed > count / 2
+    # What leaves behind the surface is no light of it.
+    assert weight_of_opening(receivers, 0, -np.abs(towards), 0) == pytest.approx(math.pi)
 
 
 def test_the_openings_bring_what_the_points_inside_receive(world: World) -> None:

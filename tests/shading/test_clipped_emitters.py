@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from usdbrdf.shading import clipped_emitters as module
 from usdbrdf.shading.clipped_emitters import (
     ERROR_ALONE,
     LAMP_PRIOR,
@@ -214,3 +217,29 @@ def test_without_texels_nothing_is_known():
     )
     assert not found.determined.any()
     np.testing.assert_array_equal(found.multiplier, 1)
+
+
+@pytest.mark.parametrize("misfit", [0.5, 3.0])
+def test_texels_that_fit_worse_than_their_errors_say_make_lamps_less_certain(
+    monkeypatch: pytest.MonkeyPatch, misfit: float
+):
+    """By the root of their mean square over the degrees of freedom, which each segment's albedo and
+    each lamp take one of; texels that fit better do not make them more certain."""
+    curvature, sizes, prior = np.diag([400.0, 100.0]), (9, 6, 7), np.array([[0.0, 2.0], [0, 0.5]])
+    segments = [SimpleNamespace(index=np.arange(n), object=k) for k, n in enumerate(sizes)]
+    for segment in segments:
+        segment.ambient = np.zeros(len(segment.index))
+    freedom = sum(sizes) - len(sizes) - 2
+    square = misfit * freedom * np.array([1.0, 1.0, 2.0]) / 3
+
+    def equations(*_given: Any) -> Any:
+        return np.tile(curvature, (3, 1, 1)) / 3, np.zeros((3, 2)), square
+
+    monkeypatch.setattr(module, "normal_equations", equations)
+    monkeypatch.setattr(module, "lamp_share", lambda _e, item, _g: np.ones((2, len(item.index), 3)))
+    weighed: Any = [(segment, np.eye(len(segment.index))) for segment in segments]
+    evidence: Any = SimpleNamespace(prior=prior, shines=np.zeros(2, np.bool_))
+    found = module._standard_error(evidence, weighed, np.zeros(2), np.zeros(3))
+    told = 1 / (np.diag(curvature) + prior[:, 1] ** -2)
+    wanted = told[:, None] * np.maximum(misfit * np.array([1.0, 1.0, 2.0]), 1)
+    np.testing.assert_allclose(found, np.sqrt(wanted + module.LEAST_ERROR**2))

@@ -240,3 +240,30 @@ def test_the_level_is_that_at_which_a_lamp_brings_as_much_as_all_else(hall, monk
     assert not len(found([]).object)
     assert not len(found([1], asked=asked.of(np.zeros(64, bool))).object)
     assert not len(found([4]).object)
+
+
+def test_a_part_that_clips_is_among_those_that_may_shine(hall, monkeypatch):
+    """Panel 1 as the second of three parts, with numbers of their own: no object is likely."""
+    texels, surface, numbers = hall.texels, _surface(hall), np.array([3, 5, 8])
+    floor, owner = np.arange(64), texels.object_index()
+    share = np.array([_form_factor(p, (0.25, 0, 2), 0.01) for p in texels.position[floor]])
+    light = np.full(64, 0.5)
+    reflected = 0.4 * (light + 4 * np.median(light / share) * share)
+    asked = _asked(reflected, light)._replace(texel=floor)
+    parts = {3: 4, 5: 1, 8: 3}  # numbers of parts, and the objects that they are here
+
+    def as_lamps(which) -> Lamps:
+        of = np.full(len(owner), -1)
+        for k, number in enumerate(which):
+            of[owner == parts[number]] = k
+        count = len(which)
+        return Lamps(of, np.zeros((count, 3)), np.ones(count), np.ones(count, np.bool_))
+
+    monkeypatch.setattr(module, "beside_lamps", lambda _s, _l, _e, few, *_: few)
+    monkeypatch.setattr(module, "strongest", lambda _groups: numbers)
+    lit = np.zeros((len(texels), 3), np.float32)
+    given = surface, lit, black_environment(), asked
+    found = likely_lamps(*given, np.array([2]), SimpleNamespace(as_lamps=as_lamps), {}, 0)
+    assert found.clipped.tolist() == [5]
+    assert not len(found.object)
+    assert found.usual.shape == (0, 3)

@@ -140,8 +140,9 @@ def test_pictures_are_drawn_in_parts_alike(monkeypatch):
     light = surface.texture(_light(world))
     camera = replace(_camera((0.3, 0.1, 1.2)), height=HEIGHT - 1)
     whole = light_on_pixels(surface, light, camera)
-    monkeypatch.setattr(module, "_AT_ONCE", 7 * 4 * WIDTH)
-    np.testing.assert_array_equal(light_on_pixels(surface, light, camera), whole)
+    for points in (7 * 4 * WIDTH, 1):  # seven rows of pixels, and less than one
+        monkeypatch.setattr(module, "_AT_ONCE", points)
+        np.testing.assert_array_equal(light_on_pixels(surface, light, camera), whole)
     # What pixels cover of the surface alone counts, and beyond it there is none.
     assert whole.max() <= 8.01
     assert whole.min() == 0

@@ -57,6 +57,14 @@ def test_a_lens_without_falloff_is_left_alone():
     assert falloff_of_frames(_samples(K1, K2, points=50)) is None
 
 
+def test_highlights_in_the_middle_of_frames_are_no_falloff():
+    """As of a lamp beside the camera: they count up to where errors end, and by no more."""
+    samples, rng = _samples(0, 0), np.random.default_rng(6)
+    shines = (samples.radius2 < 0.25) & (rng.random(samples.radius2.shape) < 0.03)
+    samples.logarithm[shines] += 2.0  # by least squares half a stop
+    assert abs(falloff_of_frames(samples).stops) < 0.08
+
+
 def test_more_than_lenses_do_is_none_of_their_doing():
     """As of a mesh that does not fit, or of a lamp at the camera."""
     found = falloff_of_frames(_samples(-2, -3))

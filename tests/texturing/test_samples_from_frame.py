@@ -16,7 +16,9 @@ from usdbrdf.texturing.samples import (
     NOTHING,
     SAMPLE,
     Picture,
+    Projection,
     first_surfaces,
+    project,
     samples_from_frame,
 )
 
@@ -326,3 +328,17 @@ def test_texels_in_the_outermost_pixels_give_nothing_and_all_others_do():
     for side in (column, WIDTH - column, row, HEIGHT - row):
         assert ((side > 1) & (side < 2) & (near == side)).any()
         assert ((side > 0) & (side < 1) & (near == side)).any()
+
+
+def test_a_point_beside_a_texel_is_projected_as_by_its_camera():
+    rng = np.random.default_rng(3)
+    camera = camera_at(_camera(), LENS, WIDTH, HEIGHT)
+    for _ in range(20):
+        p, sx, sy = rng.uniform(-0.5, 0.5, (3, 3)).astype(np.float32)
+        dx, dy = rng.uniform(-1, 1, 2)
+        point = p + dx * sx.astype(float) + dy * sy
+        u, v, depth = project(p, sx, sy, dx, dy, Projection.of(camera))
+        np.testing.assert_allclose((u, v), camera.project(point[None])[0], rtol=1e-5)
+        assert depth == pytest.approx((camera.eye - point) @ camera.world_from_camera[:3, 2])
+    behind = np.float32(camera.eye + camera.world_from_camera[:3, 2])
+    assert project(behind, sx, sy, 0.0, 0.0, Projection.of(camera)) == (0, 0, -1)

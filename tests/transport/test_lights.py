@@ -13,7 +13,7 @@ from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lights import GROUP, LightGroups, Lights, TilePicks, weighed_groups
 from usdbrdf.transport.openings import NO_OPENINGS
-from usdbrdf.transport.sampling_loops import Picked, PointDraws, Receivers, pick_triangles
+from usdbrdf.transport.sampling_loops import Picked, PointDraws, Receivers, counted, pick_triangles
 
 
 def _soup(count: int) -> Lights:
@@ -73,8 +73,9 @@ def test_densities_of_a_tile_integrate_to_one():
     assert np.abs(ratio[0] - ratio[1]).max() > 1  # the two tiles favour different lights
 
 
-def test_picks_follow_the_density_and_leave_a_uniform_number():
-    lights = _soup(300)
+@pytest.mark.parametrize("number", [1, 5, 300])
+def test_picks_follow_the_density_and_leave_a_uniform_number(number: int):
+    lights = _soup(number)
     groups = lights.groups
     tiles = _weighed(groups)
     ratio, count = tiles.ratio, 1 << 16
@@ -89,11 +90,42 @@ def test_picks_follow_the_density_and_leave_a_uniform_number():
     pick_triangles(receivers, 0, 0, even, Picked(chosen, favour, left, left))
     power = np.diff(groups.cumulative, prepend=0)
     expected = power * ratio[0, groups.triangles[:, GROUP].astype(int)]
-    np.testing.assert_allclose(np.bincount(chosen, minlength=300) / count, expected, atol=3e-5)
+    np.testing.assert_allclose(np.bincount(chosen, minlength=number) / count, expected, atol=3e-5)
     np.testing.assert_array_equal(favour, ratio[0, groups.triangles[chosen, GROUP].astype(int)])
     assert left.min() >= 0
     assert left.max() < 1
     np.testing.assert_allclose(np.histogram(left, 8, (0, 1))[0] / count, 1 / 8, atol=5e-3)
+    # And so for each light alone, the first one too: even numbers leave even ones.
+    for light in np.flatnonzero(np.bincount(chosen, minlength=number) >= 20):
+        own = np.sort(left[chosen == light])
+        evenly = (np.arange(len(own)) + 0.5) / len(own)
+        np.testing.assert_allclose(own, evenly, atol=1.01 / len(own) + 1e-3)
+
+
+def test_light_counts_by_its_angle_to_each_surface_s_own_curve():
+    """Between even cosines on a straight line, whatever the length of the direction."""
+    rng = np.random.default_rng(4)
+    normal, towards = rng.normal(size=(2, 50, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    curves = rng.random((3, 9)).astype(np.float32)
+    surface = rng.integers(3, size=50).astype(np.int32)
+    groups = _soup(1).groups
+    bits, nothing = np.zeros((0, 4), np.uint32), np.zeros((0, 3), np.float32)
+    receivers = Receivers(
+        nothing, normal, PointDraws(bits, bits, 0, np.zeros(0, np.int64)), groups,
+        np.zeros(50, np.int32), _weighed(groups), curves, surface,
+    )  # fmt: skip
+    cosine = (normal * towards).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    assert 10 < (cosine > 0).sum() < 40
+    for k in range(50):
+        wanted = np.interp(max(cosine[k], 0), np.linspace(0, 1, 9), curves[surface[k]])
+        assert counted(receivers, k, towards, k) == pytest.approx(wanted, abs=1e-5)
+        # Straight on and from behind are the curves' ends.
+        straight = np.tile(3 * normal[k], (k + 1, 1))
+        ends = [
+            counted(receivers, k, side * straight, k) for side in (np.float32(1), np.float32(-1))
+        ]
+        assert ends == pytest.approx(curves[surface[k]][[-1, 0]].tolist(), abs=1e-5)
 
 
 def _two_lamps() -> World:

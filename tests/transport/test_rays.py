@@ -10,6 +10,7 @@ from usdbrdf.errors import UsdBrdfError
 from usdbrdf.transport import rays
 from usdbrdf.transport.rays import (
     RayScene,
+    _aligned,
     closest_hits_of_groups,
     empty_hits,
     lift_from_surface,
@@ -215,3 +216,11 @@ def test_without_a_lift_a_surface_would_shade_itself():
     w *= np.sign((w * world.texels.geometric_normal).sum(axis=1, keepdims=True))
     hits = world.rays.closest(world.texels.position, w)
     assert ((hits.face >= 0) & (hits.distance < 1e-3)).any()
+
+
+@pytest.mark.parametrize("size", [16, 64])
+def test_what_embree_is_handed_lies_where_it_wants_it(size: int):
+    held = [_aligned(words, size) for words in (12, 12, 20, 21, 48)]  # wherever each comes to lie
+    assert [len(one) for one in held] == [12, 12, 20, 21, 48]
+    assert not any(one.ctypes.data % size for one in held)
+    assert not any(one.any() for one in held)
