@@ -32,8 +32,8 @@ def used(monkeypatch: pytest.MonkeyPatch) -> Any:
         # Of a texel what a patch of radiance 1 brings, pi from everywhere; half of them see twice.
         shares = np.pi * np.outer(directions, [0.0, 2.0, 1.0, 0.0, 2.0])
 
-        def traced(_look: _Look, _asked: Any, rays: int) -> Any:
-            sent.append(rays)
+        def traced(look: _Look, _asked: Any) -> Any:
+            sent.append(look.rays)
             return shares, open_share
 
         def asking(look: _Look, *_given: Any) -> Any:
@@ -64,7 +64,16 @@ def test_of_a_closed_room_a_few_rays_tell_that_it_is(used: Any) -> None:
     assert used(np.full(PATCHES, 0.1), 0.9 * least) == (None, [32])
     found, sent = used(np.full(PATCHES, 0.1), 1.1 * least)
     assert found == list(range(PATCHES))
-    assert sent == [32, 1024]
+    assert sent == [32, 8192]
+
+
+def test_the_less_leaves_a_scan_the_more_rays_tell_what_it_meets(used: Any) -> None:
+    def rays(open_share: float) -> int:
+        return int(used(np.full(PATCHES, 0.1), open_share)[1][-1])
+
+    assert rays(1.0) == rays(0.1) == 1024
+    assert rays(0.05) == 2048
+    assert rays(0.02) == 5120
 
 
 def test_texels_in_the_sun_s_half_shadow_are_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,6 +46,8 @@ from usdbrdf.shading.lamp_light import (
 from usdbrdf.shading.likely_lamps import beside_daylight
 from usdbrdf.shading.outside_light import Asked, Solution, Sources, jackknife, levelled, solved
 from usdbrdf.shading.sky_patches import (
+    FIRST_RAYS,
+    enough_rays,
     patches_of_sky,
     picture_of_sky,
     shares_of_sky,
@@ -57,8 +59,6 @@ from usdbrdf.transport.environment import NO_SUN, Environment, Sun
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.sunlight import sunlit
 
-# Rays by which each of the texels asked meets the sky: at first, and where it does.
-_FIRST_RAYS, _RAYS = 32, 1024
 # To be chosen from, and texels to the side of one that see, up to this difference of their cosine
 # to it, as much of the sun.
 _MANY_PER_SEGMENT, _AROUND, _AS_SUNLIT = 960, 2, 0.05
@@ -194,17 +194,15 @@ def light_from_outside(
     patches = patches_of_sky(limit > limit.max() / 2, z_up)
     none = np.zeros(0, np.int64)
     look = _Look(surface, lit, coverage, seen, patches, none, z_up, seed, mirrored)
-    # A look around first: of a closed room a few rays tell that it is.
-    for rays in (_FIRST_RAYS, _RAYS):
-        share, open_share = look.shares(asked, rays)
+    for _ in range(2):  # a look around first: of a closed room a few rays tell that it is
+        share, open_share = look.shares(asked)
         if open_share < _LEAST_OPEN:
             return None
+        look = look._replace(rays=enough_rays(open_share))
     say(f"shade: {100 * open_share:.0f} % of the light's directions leave the scan")
     confidence = seen.coverage.stored().reshape(HEIGHT, WIDTH)
     hidden = float(share.mean(axis=1).sum()) / np.pi
-    if (
-        seen.is_night() and hidden < _HIDDEN_BY_NIGHT * open_share
-    ):  # as all that is seen, so the rest
+    if seen.is_night() and hidden < _HIDDEN_BY_NIGHT * open_share:  # the rest is as what is seen
         as_seen = look.picture(np.zeros((0, 3)))
         return Outside(environment=as_seen, confidence=confidence, open_share=open_share)
     look = look._replace(used=np.flatnonzero(share.mean(axis=1) > _LEAST_SHARE * np.pi))
@@ -247,12 +245,13 @@ class _Look(NamedTuple):
     z_up: bool
     seed: int
     mirrored: Mirrored | None
+    rays: int = FIRST_RAYS
     lamps: Lamps | None = None
 
-    def shares(self, asked: Asked, rays: int = _RAYS) -> tuple[Double, float]:
+    def shares(self, asked: Asked) -> tuple[Double, float]:
         """As of ``shares_of_sky``, of the patches where nothing was measured."""
         unseen = np.where(self.seen.coverage.measured, -1, self.patches)
-        return shares_of_sky(self.surface, asked, unseen, self.z_up, self.seed, rays)
+        return shares_of_sky(self.surface, asked, unseen, self.z_up, self.seed, self.rays)
 
     def at(self, asked: Asked, share: Double) -> tuple[Asked, Sources]:
         """The texels asked, but the lamps', with S, W/m^2, of all that frames measured, and the

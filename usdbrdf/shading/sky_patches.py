@@ -26,6 +26,9 @@ _ALIKE = calibration.number("outside.alike")
 _ALIKE_OVER_HORIZON = calibration.number("outside.alike_over_horizon")
 _BESIDE = calibration.number("outside.alike_within")
 _SEED = 0x51C4
+# Rays by which each of the texels asked meets the sky: at first, and at least and at most where it
+# does. Where less than this part of them does there are more: what a window shows is noise in few.
+FIRST_RAYS, _RAYS, _MOST_RAYS, _OPEN = 32, 1024, 8192, 0.1
 _DARKEST = 1e-3  # of what is usual: darker sky is none
 
 
@@ -44,26 +47,38 @@ def patches_of_sky(clipped: Bool, z_up: bool) -> Int:
     return np.where(clipped, patch + first, patch).astype(np.int32)
 
 
+def enough_rays(open_share: float) -> int:
+    """From each texel, if so much of what they send leaves the scan."""
+    return int(np.clip(_RAYS * _OPEN / open_share, _RAYS, _MOST_RAYS))
+
+
 def shares_of_sky(
     surface: TexturedScene, asked: Asked, patches: Int, z_up: bool, seed: int, rays: int
 ) -> tuple[Double, float]:
     """By so many rays from each, what a patch (-1: none) of radiance 1 brings to the texels asked,
     (2 _PATCHES, N), W/m^2; and the share of the light's directions that leave the scan."""
-    count = len(asked.texel)
-    towards, face = looked_around(surface, asked.texel, seed ^ _SEED, rays)
-    out = np.flatnonzero(face < 0)
-    patch = patches[pixels_of_directions(towards[out], HEIGHT, WIDTH, z_up)]
-    texel, kept = out % count, patch >= 0
-    met = np.bincount(patch[kept] * count + texel[kept], minlength=2 * _PATCHES * count)
+    count, num_out = len(asked.texel), 0
+    met = np.zeros(2 * _PATCHES * count, np.int64)
+    for turn, first in enumerate(range(0, rays, _RAYS)):
+        some = min(_RAYS, rays - first)
+        towards, face = looked_around(surface, asked.texel, (seed ^ _SEED) + turn, some)
+        out = np.flatnonzero(face < 0)
+        patch = patches[pixels_of_directions(towards[out], HEIGHT, WIDTH, z_up)]
+        texel, kept = out % count, patch >= 0
+        met += np.bincount(patch[kept] * count + texel[kept], minlength=len(met))
+        num_out += len(out)
     brought = np.asarray(np.pi / rays * met.reshape(2 * _PATCHES, count), np.float64)
-    return brought, len(out) / len(towards)
+    return brought, num_out / (rays * count)
 
 
 def sources_in_sky(
     asked: Asked, seen: Surroundings, patches: Int, share: Double, used: Long, z_up: bool
 ) -> Sources:
     """The patches that light what is asked."""
-    known, usual = seen.coverage.measured, seen.trend(z_up)
+    # What clips shines as well, above what saturates.
+    known, usual, dark = seen.coverage.observed, seen.trend(z_up), seen.dark
+    shown = seen.radiance.astype(np.float64)
+    shown[seen.coverage.clipped] *= np.exp(_ABOVE_LIMIT[0])
     # Where all is dark that was seen, but not all that lights the scan was, the rest is not.
     if not usual.any() or seen.is_night():
         usual = np.tile(np.median(asked.reflected, axis=0) / np.pi, (len(usual), 1))
@@ -78,7 +93,10 @@ def sources_in_sky(
         if bound[k]:
             mean[k] = np.log(seen.radiance[patches == patch].max(axis=0)) + _ABOVE_LIMIT[0]
         elif near.any():
-            mean[k] = np.log(np.maximum(np.median(seen.radiance[near], axis=0), darkest))
+            # Where some of it is dark, as below a horizon, as much of the patch is.
+            shines = near & ~dark if (near & ~dark).any() else near
+            part = np.count_nonzero(shines) / np.count_nonzero(near)
+            mean[k] = np.log(np.maximum(part * np.median(shown[shines], axis=0), darkest))
         else:
             mean[k] = np.log(np.maximum(usual[patches == patch], darkest)).mean(axis=0)
     centre /= np.linalg.norm(centre, axis=1, keepdims=True)
