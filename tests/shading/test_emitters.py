@@ -138,6 +138,23 @@ def test_the_dark_measured_half_of_a_lamp_says_nothing_of_how_bright_it_is(
     np.testing.assert_allclose(found.radiance[LAMP], [8, 7, 6], rtol=1e-6)
 
 
+def test_a_lamp_by_word_is_as_bright_as_what_was_seen_of_it_though_what_was_not_is_brighter(
+    world: World, lit: np.ndarray
+):
+    """What nobody saw was filled in, and less light may come to it."""
+    own = np.flatnonzero(world.texels.object_index() == LAMP)
+    front, back = own[: len(own) // 2], own[len(own) // 2 :]
+    lit[own] = 0.9 * SHADING / np.pi
+    shading = np.full_like(lit, SHADING)
+    shading[back] /= 4
+    seen = np.ones(len(lit), bool)
+    seen[back] = False
+    found = find_emitters(world.texels, lit, shading, seen, ~seen & False, said={LAMP: True})
+    assert found.is_lamp[LAMP]
+    assert not found.lower_bound[LAMP]
+    np.testing.assert_allclose(found.radiance[LAMP], lit[front[0]], rtol=1e-6)
+
+
 def test_no_wall_shines_while_a_lamp_is_too_dark(world: World, lit: np.ndarray):
     # The lamp is known as 8 at least and is brighter: S is half of what it should be, and a wall of
     # albedo 0.75 looks like 1.5.

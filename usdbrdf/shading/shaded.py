@@ -103,7 +103,7 @@ def find_emitters(
             is_lamp[i], lower_bound[i], emissive[own] = True, True, True
             mean[i] = radiance[own].mean(axis=0)
             continue
-        glows = emissive[own] & shines[own]
+        glows = emissive[own] & shines[own] & (area > 0)
         weight = area * (glows if glows.any() else emissive[own])
         exact = weight * seen[own]
         # Some of a lamp is often seen in long exposures alone; what the short one shows counts.
