@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from tests.physics.surfaces import Part, World, quad, room, world_of
 from usdbrdf.model.texels import CoverageMap
@@ -113,6 +116,45 @@ def test_a_lamp_reaches_no_farther_into_what_nobody_saw_than_it_is_wide(world: W
     away = np.linalg.norm(place[found][:, None] - place[lamp], axis=2).min(axis=1)
     radius = np.sqrt(world.texels.area[lamp].sum() / np.pi)
     assert 0.8 * radius < away.max() < radius
+
+
+def test_a_lamp_s_neighbourhood_alone_is_looked_at(world: World, own, monkeypatch):
+    """Walls have millions of texels, and parts that clip by the hundred."""
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
+    wall = own(WALL).reshape(32, 32)
+    lamp = wall[12:16, 12:16].ravel()
+    lit[lamp] = BOUND
+    looked: list[int] = []
+
+    class Tree(cKDTree):
+        def __init__(self, points):
+            looked.append(len(points))
+            super().__init__(points)
+
+        def query(self, points, *given, **more):
+            found = super().query(points, *given, **more)
+            looked.append(len(points) if self.m == 6 else 0)
+            return found
+
+    monkeypatch.setattr(clipped_light, "cKDTree", Tree)
+    unseen = [*wall[8:20, 16:20].ravel(), *wall[24:].ravel()]
+    found = _groups(world, lit, lamp, unseen=unseen)
+    assert np.count_nonzero(found.group == 0) > len(lamp)
+    assert max(looked) < 150
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+def test_a_part_without_area_or_with_all_around_it_seen_is_what_was_seen(world: World, own, hidden):
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
+    wall = own(WALL).reshape(32, 32)
+    lamp, beside = wall[8:16, 8:16].ravel(), wall[8:16, 16:20].ravel()
+    lit[lamp] = BOUND
+    area = world.texels.area.copy()
+    area[lamp] = 0 if hidden else area[lamp]
+    texels = replace(world.texels, area=area)
+    observed = np.setdiff1d(own(WALL), beside)
+    part = clipped_light._with_unseen(texels, lamp, observed, beside if hidden else beside[:0])
+    np.testing.assert_array_equal(part, lamp)
 
 
 def _two_faced(front: Part, back: Part) -> Part:

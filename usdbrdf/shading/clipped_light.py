@@ -167,11 +167,20 @@ def _with_unseen(texels: Texels, part: Long, observed: Long, unseen: Long) -> Lo
     in units of the lamp's own radius, or of how far a normal turns by 60 degrees, and by no more
     than one. A lamp that is seen in part would otherwise be as much too bright as it is too small.
     """
-    radius = np.sqrt(texels.area[part].sum() / np.pi)
+    radius = float(np.sqrt(texels.area[part].sum() / np.pi))
+    low, high = texels.position[part].min(axis=0), texels.position[part].max(axis=0)
+
+    def within(index: Long, reach: float) -> Long:
+        at = texels.position[index]
+        return index[((at >= low - reach) & (at <= high + reach)).all(axis=1)]
 
     def place(index: Long) -> Float:
         return np.hstack([texels.position[index] / radius, texels.geometric_normal[index]])
 
+    # A wall has millions of texels: what is farther off than this is in no one's reach.
+    unseen, observed = within(unseen, radius), within(observed, 2 * radius)
+    if not len(unseen) or not radius:
+        return part
     distance, nearest = cKDTree(place(observed)).query(place(unseen), distance_upper_bound=1.0)
     near = np.isfinite(distance)
     near[near] = np.isin(observed[nearest[near]], part)
