@@ -82,13 +82,20 @@ def test_light_is_doubted_as_the_lamps_that_bring_most_of_it():
     none = SimpleNamespace(object=np.zeros(0, np.int32), error=np.zeros(0, np.float32))
     unseen = SimpleNamespace(object=np.array([3], np.int32), error=np.array([0.4], np.float32))
     outside = SimpleNamespace(doubt=0.15)
-    assert _doubt(texels, clipped, none, None) == pytest.approx(0.2)
-    assert _doubt(texels, clipped, none, outside) == pytest.approx(0.25)
+    dark, seen = np.zeros((8, 3), np.float32), np.repeat([True, False, False, True], 2)
+    assert _doubt(texels, clipped, none, None, seen, dark) == pytest.approx(0.2)
+    assert _doubt(texels, clipped, none, outside, seen, dark) == pytest.approx(0.25)
     # The one weighs three times as much as the other.
     both = np.hypot(0.75 * 0.2, 0.25 * 0.4)
-    assert _doubt(texels, clipped, unseen, None) == pytest.approx(both)
+    assert _doubt(texels, clipped, unseen, None, seen, dark) == pytest.approx(both)
+    # Walls keep less than the lamp sends, or much more: then there is other light. What falls on
+    # what nobody saw, as the outside of walls, is none of theirs.
+    for level, share in ((2, 1), (11, 3 / 20)):
+        light = np.full((8, 3), level * np.pi, np.float32)
+        light[~seen] *= 100
+        assert _doubt(texels, clipped, none, None, seen, light) == pytest.approx(0.2 * share)
     clipped.estimate.determined[:] = False
-    assert _doubt(texels, clipped, none, None) == 0
+    assert _doubt(texels, clipped, none, None, seen, dark) == 0
 
 
 @pytest.mark.parametrize("hidden", [True, False])

@@ -401,21 +401,31 @@ def _lit_by_unseen_lamps(
 
 
 def _doubt(
-    texels: Texels, light: ClippedLight, unseen: UnseenLamps, outside: Outside | None
+    texels: Texels,
+    light: ClippedLight,
+    unseen: UnseenLamps,
+    outside: Outside | None,
+    measured: Bool,
+    irradiance: Float,
 ) -> float:
     """Relative standard error of S by what lights the scan and is inferred: the lamps that clip or
-    that no frame shows, weighed by their power, and what is outside."""
+    that no frame shows, weighed by their power, and what is outside. All lamps, measured ones and
+    the sky too, send at least what ``measured`` surfaces do not send on of S, ``irradiance``
+    (T, 3): the sky falls on the outside of walls too, which lights nothing that was measured."""
     lamps = np.flatnonzero(light.groups.lamp & light.estimate.determined)
     known = (
         (float(light.estimate.standard_error[k].max()), light.groups.group == k) for k in lamps
     )
     guessed = zip(unseen.error.tolist(), unseen.object.tolist(), strict=True)
     known_unseen = ((error, texels.object_index() == number) for error, number in guessed)
-    power, doubt = 0.0, 0.0
+    power, doubt, inferred = 0.0, 0.0, np.zeros(len(texels.area), np.bool_)
     for error, own in (*known, *known_unseen):
         one = float(texels.area[own] @ light.lit[own].mean(axis=1))
-        power, doubt = power + one, math.hypot(doubt, error * one)
-    return math.hypot(doubt / max(power, 1e-30), outside.doubt if outside else 0.0)
+        power, doubt, inferred = power + one, math.hypot(doubt, error * one), inferred | own
+    kept = np.maximum(irradiance / np.pi - light.lit, 0).mean(axis=1)
+    told = measured & ~inferred
+    every = max(power, float(texels.area[told] @ kept[told]), 1e-30)
+    return math.hypot(doubt / every, outside.doubt if outside else 0.0)
 
 
 def shade_surface(
@@ -445,7 +455,7 @@ def shade_surface(
     irradiance = denoised_irradiance(surface.texels, traced.mean) if filtered else traced.mean
     texels, seen = surface.texels, coverage.measured
     may_shine = light.may_shine(coverage.clipped)
-    doubt = _doubt(texels, light, unseen, outside)
+    doubt = _doubt(texels, light, unseen, outside, seen, irradiance)
     dimmest = light.least_of_lamps(clear_of(doubt) / np.pi * irradiance.max(axis=1))
     emitters = find_emitters(
         texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt
