@@ -172,7 +172,7 @@ def _with_unseen(texels: Texels, part: Long, observed: Long, unseen: Long) -> Lo
 
     def within(index: Long, reach: float) -> Long:
         at = texels.position[index]
-        return index[((at >= low - reach) & (at <= high + reach)).all(axis=1)]
+        return index[np.all((at >= low - reach) & (at <= high + reach), axis=1)]
 
     def place(index: Long) -> Float:
         return np.hstack([texels.position[index] / radius, texels.geometric_normal[index]])
