@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.cli import main
-from usdbrdf.files.frames import read_frame
+from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.options import IngestOptions
@@ -158,6 +159,31 @@ def test_poses_that_fit_under_no_reading_raise_a_doubt(capture, tmp_path, capsys
     (warning,) = [one for one in warnings if one.endswith("[capture.agreement]")]
     assert warning in err
     assert str(tmp_path) not in warning
+
+
+def test_of_photographs_the_pixels_that_points_lie_in_are_looked_at_alone():
+    """Other readings of the poses look them up again and again, and they have millions."""
+    points = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], np.float32)
+    rays = RayScene(points, np.array([[0, 1, 2]], np.int32))
+    places = np.array([[0.0, 0, 0], [0.1, 0.2, 0]])
+    surface = MeshPoints(places, np.tile([0.0, 0, 1], (2, 1)), np.zeros(2, np.int32))
+    pose, size = np.eye(4), 3000
+    pose[2, 3] = 2
+    camera = camera_at(pose, np.full(4, size / 2), size, size)
+    image, mask = np.ones((size, size, 3), np.float32), np.zeros((size, size), bool)
+    pixels = FramePixels(
+        radiance=image, valid=~mask, clipped=mask, dark=mask, unknown=mask, transparent=mask,
+        num_clamped=0,
+    )  # fmt: skip
+    logarithms_in_frame(surface, rays, camera, pixels)
+    tracemalloc.start()
+    try:
+        shown = logarithms_in_frame(surface, rays, camera, pixels)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(shown, 0)
+    assert most < size * size / 10
 
 
 def test_few_samples_say_nothing():

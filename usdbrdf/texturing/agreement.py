@@ -68,11 +68,15 @@ def logarithms_in_frame(
     pixels; NaN where it shows nothing valid."""
     found = np.full(len(surface.point), np.nan, np.float32)
     seen, column, row = seen_points(surface, rays, camera)
-    level = pixels.radiance.mean(axis=2)
-    level = np.where(pixels.valid & (level > 0), level, np.nan)
-    around = [level[row + down, column + right] for down in (-1, 0, 1) for right in (-1, 0, 1)]
-    found[seen] = np.log(np.mean(around, axis=0))
+    places = [(row + down, column + right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
+    found[seen] = np.log(np.mean([_levels(pixels, place) for place in places], axis=0))
     return found
+
+
+def _levels(pixels: FramePixels, place: tuple[Long, Long]) -> Float:
+    """Means of R, G and B of some pixels alone: photographs have millions; NaN where not valid."""
+    level = pixels.radiance[place].mean(axis=1)
+    return np.where(pixels.valid[place] & (level > 0), level, np.nan)
 
 
 def seen_points(surface: MeshPoints, rays: RayScene, camera: Camera) -> tuple[Bool, Long, Long]:
