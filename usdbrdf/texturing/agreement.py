@@ -24,6 +24,7 @@ from usdbrdf.transport.rays import RayScene
 MIN_COSINE = calibration.number("agreement.min_cosine")
 _AGREES = calibration.number("agreement.agrees")
 _BETTER = calibration.number("agreement.better")
+_PLAIN = calibration.number("agreement.plain")
 _POINTS, _SEED = 4096, 0
 # Samples of points that several frames see, without which nothing is said.
 _FEWEST = 500
@@ -162,6 +163,8 @@ def other_convention(given: Agreement | None, others: Mapping[str, Agreement | N
     """The one of ``others``, readings of the poses by name, under which frames clearly agree while
     they hardly do as the poses are ``given``; "" where there is none."""
     given = given or Agreement(1.0, 1.0, _FEWEST, 1.0, 0.0)
+    if given.ratio < _PLAIN:
+        return ""
 
     def clearly_better(other: Agreement) -> bool:
         return (
