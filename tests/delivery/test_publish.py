@@ -78,10 +78,11 @@ def test_a_version_needs_nothing_else_and_is_what_the_asset_was(room, tmp_path):
     assert own_findings(stage) == []
 
 
-@pytest.mark.parametrize("place", ["v001", "v001/layers/new"])
+@pytest.mark.parametrize("place", ["v001", "v001/layers/new", "../latest", "../latest/new"])
 def test_nothing_is_published_into_a_version(room, tmp_path, place):
     dest, folder = tmp_path / "dest", room.asset.folder
     publish(folder, dest)
+    (tmp_path / "latest").symlink_to("dest/v001")
     before = bytes_of(dest)
     with pytest.raises(OwnershipConflict, match=r"v001 is a published version, .*destination\]$"):
         publish(folder, dest / place)
@@ -89,6 +90,11 @@ def test_nothing_is_published_into_a_version(room, tmp_path, place):
     assert sorted(entry.name for entry in (dest / "v001").iterdir() if entry.is_dir()) == sorted(
         {path.split("/")[0] for path in read_manifest(dest / "v001").files if "/" in path}
     )
+
+
+def test_the_folder_of_versions_may_be_named_by_way_of_one(room, tmp_path):
+    publish(room.asset.folder, tmp_path / "dest")
+    assert not publish(room.asset.folder, tmp_path / "dest" / "v001" / "..")["new"]
 
 
 def test_no_version_says_where_the_capture_lay(room, tmp_path):

@@ -19,7 +19,7 @@ import pytest
 
 from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, OwnershipConflict
 from usdbrdf.files.atomic import TEMPORARY_PREFIX
-from usdbrdf.job.ownership import edited_files, owned_folder
+from usdbrdf.job.ownership import edited_files, owned_folder, writing_alone
 
 
 def own(asset):
@@ -347,3 +347,8 @@ def test_links_within_the_asset_and_of_the_asset_are_followed(tmp_path, toy):
     (own_folder / "textures").symlink_to("maps")
     assert toy.run_toy(own_folder, 2).reran
     assert not toy.run_toy(own_folder, 2).reran
+
+
+def test_a_folder_that_is_gone_is_the_machine_s_and_no_defect(tmp_path):
+    with pytest.raises(EnvironmentFailure, match="gone"), writing_alone(tmp_path / "gone"):
+        pass

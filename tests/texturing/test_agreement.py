@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.conventions import CONVENTIONS
 from usdbrdf.cli import main
-from usdbrdf.files.frames import read_frame
+from usdbrdf.files.frames import FramePixels, read_frame
 from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.options import IngestOptions
@@ -124,7 +125,7 @@ def test_a_mesh_of_another_unit_is_told(capture, factors, named, capsys):
     assert named in err
     if factors[0] == 1 / 0.3048:
         differ = float(re.search(r"\(differ by (\d+)%", err)[1]) / 100
-        assert not is_doubtful(Agreement(0.1, differ, 1000))
+        assert not is_doubtful(Agreement(0.1, differ, 1000, differ, 0.0))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -160,13 +161,38 @@ def test_poses_that_fit_under_no_reading_raise_a_doubt(capture, tmp_path, capsys
     assert str(tmp_path) not in warning
 
 
+def test_of_photographs_the_pixels_that_points_lie_in_are_looked_at_alone():
+    """Other readings of the poses look them up again and again, and they have millions."""
+    points = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], np.float32)
+    rays = RayScene(points, np.array([[0, 1, 2]], np.int32))
+    places = np.array([[0.0, 0, 0], [0.1, 0.2, 0]])
+    surface = MeshPoints(places, np.tile([0.0, 0, 1], (2, 1)), np.zeros(2, np.int32))
+    pose, size = np.eye(4), 3000
+    pose[2, 3] = 2
+    camera = camera_at(pose, np.full(4, size / 2), size, size)
+    image, mask = np.ones((size, size, 3), np.float32), np.zeros((size, size), bool)
+    pixels = FramePixels(
+        radiance=image, valid=~mask, clipped=mask, dark=mask, unknown=mask, transparent=mask,
+        num_clamped=0,
+    )  # fmt: skip
+    logarithms_in_frame(surface, rays, camera, pixels)
+    tracemalloc.start()
+    try:
+        shown = logarithms_in_frame(surface, rays, camera, pixels)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(shown, 0)
+    assert most < size * size / 10
+
+
 def test_few_samples_say_nothing():
     assert agreement(np.full((100, 4), np.nan, np.float32)) is None
     assert agreement(np.zeros((100, 4), np.float32)) is None
-    good, bad = Agreement(0.05, 0.1, 5000), Agreement(0.5, 0.9, 5000)
+    good, bad = Agreement(0.05, 0.1, 5000, 0.1, 0), Agreement(0.5, 0.9, 5000, 0.9, 0)
     assert other_convention(bad, {"a": bad, "b": good, "c": None}) == "b"
     assert other_convention(bad, {"b": good._replace(samples=900)}) == ""
-    assert other_convention(bad, {"a": bad._replace(ratio=0.8)}) == ""
+    assert other_convention(bad, {"a": bad._replace(ratio=0.8, inside=0.8)}) == ""
     assert other_convention(None, {"b": good}) == "b"
 
 
@@ -242,7 +268,7 @@ def test_some_frames_are_judged_by_all():
 
 def test_another_reading_must_be_clearly_better_good_and_see_as_much():
     def of(ratio: float, samples: int = 1000) -> Agreement:
-        return Agreement(0.1, ratio, samples)
+        return Agreement(0.1, ratio, samples, ratio, 0.0)
 
     given = of(0.9)
     assert is_doubtful(given)
@@ -258,6 +284,48 @@ def test_another_reading_must_be_clearly_better_good_and_see_as_much():
     assert other_convention(of(1.2), {"a": of(0.66)}) == ""
     assert other_convention(of(0.02), others) == ""
     assert other_convention(given, {}) == ""
+
+
+def test_frames_that_see_a_spot_each_do_not_agree_better_than_those_that_see_it_all():
+    """A book, seen from in front and from behind, of covers that are plain in the middle: from
+    a thousand times as far each frame shows one colour, and these agree within 2 %."""
+    rng = np.random.default_rng(0)
+    side = np.where(np.arange(16) % 2, 1.0, -1.0)
+    shown = np.where(np.arange(600)[:, None] % 2 == np.arange(16) % 2, side, np.nan)
+    printed = rng.normal(0, 0.6, (600, 1))
+    near = shown + printed + rng.normal(0, 0.2, shown.shape)
+    spot = shown + rng.normal(0, 0.02, 16)
+    given, other = agreement(near.astype(np.float32)), agreement(spot.astype(np.float32))
+    assert given.inside < 0.5
+    assert other.ratio < 0.5 * given.ratio
+    assert other.inside > 0.9
+    assert other_convention(given, {"millimetres": other}) == ""
+    # As much detail in the frames, and it is the better one.
+    fine = (shown + printed + rng.normal(0, 0.02, shown.shape)).astype(np.float32)
+    assert other_convention(given, {"turned": agreement(fine)}) == "turned"
+
+
+def test_readings_that_differ_by_chance_are_no_better():
+    """A cube turned by a quarter looks as it did: other points of it are asked, of which some few
+    lie on an edge."""
+    side = np.where(np.arange(1000) % 2, 1.0, -1.0)
+
+    def on_edge(points: int) -> Agreement:
+        shown = np.tile(side[:, None], 4).astype(np.float32)
+        shown[:points, 0] *= -1
+        found = agreement(shown)
+        assert found is not None
+        # Of each point on an edge one of four samples is off by 2, of a spread of 1.
+        assert found.ratio == pytest.approx(points * 2 * math.sqrt(4 / 3) / 4000, rel=1e-3)
+        assert found.error == pytest.approx(found.ratio * math.sqrt(1 / points - 1e-3), rel=1e-3)
+        return found
+
+    few = on_edge(12)._replace(ratio=0.12, inside=0.12, error=0.12 / math.sqrt(12))
+    fewer = on_edge(6)._replace(ratio=0.06, inside=0.06, error=0.06 / math.sqrt(6))
+    assert other_convention(few, {"turned": fewer}) == ""
+    assert other_convention(on_edge(300), {"turned": on_edge(150)}) == "turned"
+    # The chance is small enough, but so is what frames differ by.
+    assert other_convention(on_edge(170), {"turned": on_edge(20)}) == ""
 
 
 def test_points_are_even_over_a_mesh_by_area():

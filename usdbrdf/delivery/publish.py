@@ -67,11 +67,11 @@ def publish(
             f"{destination}: this is a file, and versions are published into a folder. Choose "
             "another place. [publish.destination]"
         )
-    inner = destination.absolute()
-    for folder in (inner, *inner.parents):
-        if (folder / MANIFEST).is_file() and _VERSION.fullmatch(folder.name):
+    inner = destination.resolve()
+    for place in (inner, *inner.parents):
+        if (place / MANIFEST).is_file() and _VERSION.fullmatch(place.name):
             raise OwnershipConflict(
-                f"{destination}: {folder} is a published version, which never changes. Name the "
+                f"{destination}: {place} is a published version, which never changes. Name the "
                 "folder of all versions. [publish.destination]"
             )
     with reading(asset.folder, wait_s=wait_s):

@@ -132,8 +132,10 @@ def reading(*places: Path, wait_s: float = 0.0) -> Iterator[None]:
 def writing_alone(folder: Path) -> Iterator[None]:
     """Hold what all processes that call this of a folder hold in turn, for moments: between reading
     and writing a file that a run leaves alone. Where the file system has no such locks nothing is
-    held. Nothing is left in the folder, which may be of people alone."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC | os.O_DIRECTORY)
+    held. Nothing is left in the folder, which may be of people alone. EnvironmentFailure where it
+    is not there any more."""
+    with environment_failures(str(folder)):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC | os.O_DIRECTORY)
     try:
         with suppress(OSError):
             fcntl.flock(descriptor, fcntl.LOCK_EX)

@@ -7,6 +7,7 @@ tells the frames' gains too, before hours are spent.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -23,9 +24,12 @@ from usdbrdf.transport.rays import RayScene
 MIN_COSINE = calibration.number("agreement.min_cosine")
 _AGREES = calibration.number("agreement.agrees")
 _BETTER = calibration.number("agreement.better")
+_PLAIN = calibration.number("agreement.plain")
 _POINTS, _SEED = 4096, 0
 # Samples of points that several frames see, without which nothing is said.
 _FEWEST = 500
+# Standard errors by which another reading must be better than the one that is given.
+_SURE = 4.0
 # How much nearer than a point another surface may lie that does not hide it, of its distance.
 _SLACK = 5e-3
 
@@ -68,11 +72,15 @@ def logarithms_in_frame(
     pixels; NaN where it shows nothing valid."""
     found = np.full(len(surface.point), np.nan, np.float32)
     seen, column, row = seen_points(surface, rays, camera)
-    level = pixels.radiance.mean(axis=2)
-    level = np.where(pixels.valid & (level > 0), level, np.nan)
-    around = [level[row + down, column + right] for down in (-1, 0, 1) for right in (-1, 0, 1)]
-    found[seen] = np.log(np.mean(around, axis=0))
+    places = [(row + down, column + right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
+    found[seen] = np.log(np.mean([_levels(pixels, place) for place in places], axis=0))
     return found
+
+
+def _levels(pixels: FramePixels, place: tuple[Long, Long]) -> Float:
+    """Means of R, G and B of some pixels alone: photographs have millions; NaN where not valid."""
+    level = pixels.radiance[place].mean(axis=1)
+    return np.where(pixels.valid[place] & (level > 0), level, np.nan)
 
 
 def seen_points(surface: MeshPoints, rays: RayScene, camera: Camera) -> tuple[Bool, Long, Long]:
@@ -104,11 +112,16 @@ class Agreement(NamedTuple):
     ratio    as a share of how much all samples differ: about 0 where all is well, about 1 where the
              poses tell nothing
     samples  how many were compared
+    inside   as a share of how much samples of one frame differ: about 1 too where all that frames
+             see is a spot
+    error    standard error of the ratio, by which points were asked
     """
 
     scatter: float
     ratio: float
     samples: int
+    inside: float
+    error: float
 
 
 def agreement(logarithm: Float, judged: Bool | None = None) -> Agreement | None:
@@ -129,20 +142,43 @@ def agreement(logarithm: Float, judged: Bool | None = None) -> Agreement | None:
     number = known[rows].sum(axis=1, keepdims=True)
     off *= np.sqrt(number / (number - 1))
     # Means, for where most of a scene is one colour the median pixel fits any pose.
-    scatter = float(np.abs(off[compared[rows]]).mean())
+    far = np.where(compared[rows], np.abs(off), 0)
+    scatter = float(far.sum() / samples)
+    by_point = far.sum(axis=1) - scatter * compared[rows].sum(axis=1)
+    error = float(np.sqrt((by_point**2).sum()) / samples)
     level = value[known[rows]]
-    spread = float(np.abs(level - np.median(level)).mean())
-    return Agreement(scatter, scatter / max(spread, 1e-6), samples)
+    spread = max(float(np.abs(level - np.median(level)).mean()), 1e-6)
+    inside = max(_spread_in_frames(value), 1e-6)
+    return Agreement(scatter, scatter / spread, samples, scatter / inside, error / spread)
+
+
+def _spread_in_frames(value: Double) -> float:
+    """Mean difference of logarithms (P, N) from the median of their frame."""
+    frames = [column[np.isfinite(column)] for column in value.T]
+    off = [np.abs(shown - np.median(shown)) for shown in frames if len(shown)]
+    return float(np.concatenate(off).mean())
 
 
 def other_convention(given: Agreement | None, others: Mapping[str, Agreement | None]) -> str:
     """The one of ``others``, readings of the poses by name, under which frames clearly agree while
     they hardly do as the poses are ``given``; "" where there is none."""
-    ratio, samples = (given.ratio, given.samples) if given else (1.0, _FEWEST)
-    # A reading under which few points are seen at all is no better one.
-    sound = {n: a.ratio for n, a in others.items() if a and 2 * a.samples >= samples}
-    best = min(sound, key=lambda name: sound[name], default="")
-    return best if best and sound[best] < min(_BETTER * ratio, _AGREES) else ""
+    given = given or Agreement(1.0, 1.0, _FEWEST, 1.0, 0.0)
+    if given.ratio < _PLAIN:
+        return ""
+
+    def clearly_better(other: Agreement) -> bool:
+        return (
+            # A reading under which few points are seen at all is no better one,
+            2 * other.samples >= given.samples
+            and other.ratio < min(_BETTER * given.ratio, _AGREES)
+            # nor one from so far that each frame sees a spot, as of either side of a book;
+            and other.inside < min(_BETTER * given.inside, _AGREES)
+            # and those beside which a mesh looks as it did, as a cube turned, differ by chance.
+            and given.ratio - other.ratio > _SURE * math.hypot(given.error, other.error)
+        )
+
+    sound = {n: a.ratio for n, a in others.items() if a and clearly_better(a)}
+    return min(sound, key=lambda name: sound[name], default="")
 
 
 def is_doubtful(given: Agreement | None) -> bool:
