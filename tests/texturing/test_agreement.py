@@ -125,7 +125,7 @@ def test_a_mesh_of_another_unit_is_told(capture, factors, named, capsys):
     assert named in err
     if factors[0] == 1 / 0.3048:
         differ = float(re.search(r"\(differ by (\d+)%", err)[1]) / 100
-        assert not is_doubtful(Agreement(0.1, differ, 1000, differ, 0.0))
+        assert not is_doubtful(Agreement(0.1, differ, 1000, differ, 0.0, 0.5))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -189,7 +189,7 @@ def test_of_photographs_the_pixels_that_points_lie_in_are_looked_at_alone():
 def test_few_samples_say_nothing():
     assert agreement(np.full((100, 4), np.nan, np.float32)) is None
     assert agreement(np.zeros((100, 4), np.float32)) is None
-    good, bad = Agreement(0.05, 0.1, 5000, 0.1, 0), Agreement(0.5, 0.9, 5000, 0.9, 0)
+    good, bad = Agreement(0.05, 0.1, 5000, 0.1, 0, 1.0), Agreement(0.5, 0.9, 5000, 0.9, 0, 1.0)
     assert other_convention(bad, {"a": bad, "b": good, "c": None}) == "b"
     assert other_convention(bad, {"b": good._replace(samples=900)}) == ""
     assert other_convention(bad, {"a": bad._replace(ratio=0.8, inside=0.8)}) == ""
@@ -268,7 +268,7 @@ def test_some_frames_are_judged_by_all():
 
 def test_another_reading_must_be_clearly_better_good_and_see_as_much():
     def of(ratio: float, samples: int = 1000) -> Agreement:
-        return Agreement(0.1, ratio, samples, ratio, 0.0)
+        return Agreement(0.1, ratio, samples, ratio, 0.0, 0.5)
 
     given = of(0.9)
     assert is_doubtful(given)
@@ -385,3 +385,21 @@ def test_a_camera_sees_what_faces_it_within_its_picture_and_is_not_hidden():
         leaning = cosine * way + math.sqrt(1 - cosine**2) * across
         tilted = surface._replace(normal=np.tile(leaning, (len(place), 1)))
         assert seen_points(tilted, rays, camera)[0][0] == visible
+
+
+def test_frames_that_show_a_spot_each_agree_about_nothing():
+    """As of a plain room from so far that all of its mesh lies in a pixel of each frame."""
+    given = Agreement(0.1, 0.2, 5000, 0.2, 0.0, 0.5)
+    near, spot = (Agreement(0.0, 0.0, 5000, 0.0, 0.0, variety) for variety in (0.4, 1e-7))
+    assert other_convention(given, {"near": near}) == "near"
+    assert other_convention(given, {"spot": spot}) == ""
+    assert other_convention(None, {"near": near}) == "near"
+
+
+def test_variety_is_within_frames_alone():
+    rng = np.random.default_rng(3)
+    point = rng.normal(size=(800, 1))
+    each = np.tile(np.arange(4.0), (800, 1))
+    varied, plain = agreement(point + 0.01 * each), agreement(each)
+    assert varied.variety == pytest.approx(np.abs(point - np.median(point)).mean(), rel=1e-6)
+    assert plain.variety == pytest.approx(0, abs=1e-9)

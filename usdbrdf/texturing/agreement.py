@@ -115,6 +115,7 @@ class Agreement(NamedTuple):
     inside   as a share of how much samples of one frame differ: about 1 too where all that frames
              see is a spot
     error    standard error of the ratio, by which points were asked
+    variety  how much samples of one frame differ, as a natural logarithm
     """
 
     scatter: float
@@ -122,6 +123,7 @@ class Agreement(NamedTuple):
     samples: int
     inside: float
     error: float
+    variety: float
 
 
 def agreement(logarithm: Float, judged: Bool | None = None) -> Agreement | None:
@@ -148,8 +150,9 @@ def agreement(logarithm: Float, judged: Bool | None = None) -> Agreement | None:
     error = float(np.sqrt((by_point**2).sum()) / samples)
     level = value[known[rows]]
     spread = max(float(np.abs(level - np.median(level)).mean()), 1e-6)
-    inside = max(_spread_in_frames(value), 1e-6)
-    return Agreement(scatter, scatter / spread, samples, scatter / inside, error / spread)
+    variety = _spread_in_frames(value)
+    inside = scatter / max(variety, 1e-6)
+    return Agreement(scatter, scatter / spread, samples, inside, error / spread, variety)
 
 
 def _spread_in_frames(value: Double) -> float:
@@ -162,7 +165,7 @@ def _spread_in_frames(value: Double) -> float:
 def other_convention(given: Agreement | None, others: Mapping[str, Agreement | None]) -> str:
     """The one of ``others``, readings of the poses by name, under which frames clearly agree while
     they hardly do as the poses are ``given``; "" where there is none."""
-    given = given or Agreement(1.0, 1.0, _FEWEST, 1.0, 0.0)
+    given = given or Agreement(1.0, 1.0, _FEWEST, 1.0, 0.0, 0.0)
     if given.ratio < _PLAIN:
         return ""
 
@@ -173,6 +176,7 @@ def other_convention(given: Agreement | None, others: Mapping[str, Agreement | N
             and other.ratio < min(_BETTER * given.ratio, _AGREES)
             # nor one from so far that each frame sees a spot, as of either side of a book;
             and other.inside < min(_BETTER * given.inside, _AGREES)
+            and 2 * other.variety >= given.variety
             # and those beside which a mesh looks as it did, as a cube turned, differ by chance.
             and given.ratio - other.ratio > _SURE * math.hypot(given.error, other.error)
         )
