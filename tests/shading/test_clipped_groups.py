@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from tests.physics.surfaces import Part, World, quad, room, world_of
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading import clipped_light
-from usdbrdf.shading.clipped_light import clipped_groups
+from usdbrdf.shading.clipped_emitters import EstimatedRadiance
+from usdbrdf.shading.clipped_light import clipped_groups, lamps_with_unseen
 
 WALL, LAMP = 2, 6
 BOUND = 3.0
@@ -29,13 +30,31 @@ def own(world: World):
     return lambda i: np.arange(len(world.texels))[world.texels.of_object(i)]
 
 
-def _groups(world: World, lit: np.ndarray, clipped: np.ndarray, unseen=()):
+def _coverage(lit: np.ndarray, clipped: np.ndarray, unseen=()) -> CoverageMap:
     seen = np.ones(len(lit), bool)
     seen[clipped] = False
     seen[list(unseen)] = False
     over = np.zeros(len(lit), bool)
     over[clipped] = True
-    return clipped_groups(world.texels, lit, CoverageMap.of(seen, over))
+    return CoverageMap.of(seen, over)
+
+
+def _groups(world: World, lit: np.ndarray, clipped: np.ndarray, unseen=()):
+    return clipped_groups(world.texels, lit, _coverage(lit, clipped, unseen))
+
+
+def _told(world: World, lit: np.ndarray, clipped: np.ndarray, unseen, times=9.0, determined=True):
+    """The groups with what nobody saw of lamps that are so many times as bright as their bounds,
+    and how many times they are then."""
+    groups = _groups(world, lit, clipped, unseen)
+    told = EstimatedRadiance(
+        multiplier=np.tile(times * np.array([1, 0.5, 0.25]), (len(groups), 1)),
+        standard_error=np.full((len(groups), 3), 0.1),
+        determined=np.full(len(groups), determined),
+    )
+    coverage = _coverage(lit, clipped, unseen)
+    groups, told = lamps_with_unseen(world.texels, coverage, groups, told)
+    return groups, told.multiplier
 
 
 def test_walls_are_no_lamps_although_there_are_too_many_groups(world: World, own, monkeypatch):
@@ -97,13 +116,27 @@ def test_what_nobody_saw_beside_a_lamp_in_a_wall_is_part_of_it(world: World, own
     lit[lamp] = BOUND
     # Not what lies beside what was seen of the wall.
     far = wall[26:30, 8:16].ravel()
-    found = _groups(world, lit, lamp, unseen=[*beside.ravel(), *far])
+    found, times = _told(world, lit, lamp, [*beside.ravel(), *far])
     assert found.lamp.all()
     # Of these four columns two lie nearer to the wall behind them.
     assert (found.group[[*lamp, *beside[6:-6, :2].ravel()]] == 0).all()
     assert (found.group[beside[:, 2:]] == -1).all()
     assert (found.group[beside[[0, -1]]] == -1).all()
     assert set(np.flatnonzero(found.group == 0)) <= {*lamp, *beside.ravel()}
+    # Its power stays.
+    grown = np.count_nonzero(found.group == 0) / len(lamp)
+    np.testing.assert_allclose(times[0] * grown, [9, 4.5, 2.25])
+
+
+def test_only_lamps_that_are_determined_and_bright_enough_go_on_beside(world: World, own):
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
+    wall = own(WALL).reshape(32, 32)
+    lamp, beside = wall[8:16, 8:16].ravel(), wall[4:20, 16:20].ravel()
+    lit[lamp] = BOUND
+    for given in ({"determined": False}, {"times": 1.05}):
+        found, times = _told(world, lit, lamp, beside, **given)
+        np.testing.assert_array_equal(np.flatnonzero(found.group == 0), np.sort(lamp))
+        assert times[0, 0] == given.get("times", 9)
 
 
 def test_a_lamp_reaches_no_farther_into_what_nobody_saw_than_it_is_wide(world: World, own):
@@ -111,7 +144,7 @@ def test_a_lamp_reaches_no_farther_into_what_nobody_saw_than_it_is_wide(world: W
     wall = own(WALL).reshape(32, 32)
     lamp, unseen = wall[12:20, :8].ravel(), wall[:, 8:].ravel()
     lit[lamp] = BOUND
-    found = np.flatnonzero(_groups(world, lit, lamp, unseen=unseen).group == 0)
+    found = np.flatnonzero(_told(world, lit, lamp, unseen)[0].group == 0)
     place = world.texels.position
     away = np.linalg.norm(place[found][:, None] - place[lamp], axis=2).min(axis=1)
     radius = np.sqrt(world.texels.area[lamp].sum() / np.pi)
@@ -138,7 +171,7 @@ def test_a_lamp_s_neighbourhood_alone_is_looked_at(world: World, own, monkeypatc
 
     monkeypatch.setattr(clipped_light, "cKDTree", Tree)
     unseen = [*wall[8:20, 16:20].ravel(), *wall[24:].ravel()]
-    found = _groups(world, lit, lamp, unseen=unseen)
+    found, _ = _told(world, lit, lamp, unseen)
     assert np.count_nonzero(found.group == 0) > len(lamp)
     assert max(looked) < 150
 
@@ -181,6 +214,6 @@ def test_the_back_of_a_lamp_that_is_seen_in_part_is_none():
     lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
     lamp = own[down & ~strip]
     lit[lamp] = BOUND
-    found = _groups(world, lit, lamp, unseen=own[strip])
+    found, _ = _told(world, lit, lamp, own[strip])
     assert found.lamp.all()
     np.testing.assert_array_equal(np.flatnonzero(found.group == 0), own[down])

@@ -106,14 +106,13 @@ def clipped_groups(
     said: Mapping[int, bool] = MappingProxyType({}),
 ) -> ClippedGroups:
     """An object more than half of whose observed area clipped is one group, with what nobody saw
-    of it; on others each connected part is one, if it looks like a lamp with what nobody saw beside
-    it.
+    of it; on others each connected part is one.
 
     radiance (T, 3): L_d, a lower bound where ``coverage`` says clipped
     said     of objects whether they are lamps, where that is known
     """
     found: list[tuple[float, int, float, bool, Long]] = []
-    measured, clipped, unseen = coverage.measured, coverage.clipped, ~coverage.observed
+    measured, clipped = coverage.measured, coverage.clipped
     bright = radiance.max(axis=1)
     reach = _AROUND * float(np.sqrt(texels.area.sum()))
     for i in range(len(texels.resolution)):
@@ -131,8 +130,6 @@ def clipped_groups(
                 near = bright[around[distance < reach]]
                 lamp = not len(near) or float(np.median(near)) < _NEARLY * bound
             lamp = said.get(i, lamp)
-            if lamp and not whole:
-                part = _with_unseen(texels, part, own[coverage.observed[own]], own[unseen[own]])
             found.append((bound * float(texels.area[part].sum()), i, bound, lamp, part))
     wall = np.zeros(len(texels), np.bool_)
     for *_, lamp, part in found:
@@ -165,8 +162,7 @@ def _connected(texels: Texels, candidates: Long) -> list[Long]:
 def _with_unseen(texels: Texels, part: Long, observed: Long, unseen: Long) -> Long:
     """A lamp's texels, with those that no frame shows to which they are the nearest observed ones:
     in units of the lamp's own radius, or of how far a normal turns by 60 degrees, and by no more
-    than one. A lamp that is seen in part would otherwise be as much too bright as it is too small.
-    """
+    than one."""
     radius = float(np.sqrt(texels.area[part].sum() / np.pi))
     low, high = texels.position[part].min(axis=0), texels.position[part].max(axis=0)
 
@@ -185,6 +181,23 @@ def _with_unseen(texels: Texels, part: Long, observed: Long, unseen: Long) -> Lo
     near = np.isfinite(distance)
     near[near] = np.isin(observed[nearest[near]], part)
     return np.sort(np.concatenate([part, unseen[near]]))
+
+
+def lamps_with_unseen(
+    texels: Texels, coverage: CoverageMap, groups: ClippedGroups, estimate: EstimatedRadiance
+) -> tuple[ClippedGroups, EstimatedRadiance]:
+    """The groups and what they are told to send, the lamps among them that are determined with what
+    nobody saw beside them: one that is seen in part would otherwise be as much too bright as it is
+    too small. Their power stays, and none falls below its bound for that."""
+    group, multiplier = groups.group.copy(), estimate.multiplier.copy()
+    for k in np.flatnonzero(groups.lamp & estimate.determined):
+        own = np.arange(*texels.of_object(int(groups.object[k])).indices(len(texels)))
+        part, free = np.flatnonzero(group == k), own[~coverage.observed[own] & (group[own] < 0)]
+        with_unseen = _with_unseen(texels, part, own[coverage.observed[own]], free)
+        seen = texels.area[part].sum() / max(float(texels.area[with_unseen].sum()), 1e-30)
+        if multiplier[k].max() * seen >= 1:
+            group[with_unseen], multiplier[k] = k, multiplier[k] * seen
+    return replace(groups, group=group), replace(estimate, multiplier=multiplier)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,6 +281,7 @@ def estimate_clipped_light(
     found = dict(run.checkpoint("clipped", compute))
     groups = groups.with_walls(found.pop("wall"))
     estimate = EstimatedRadiance(**found)
+    groups, estimate = lamps_with_unseen(surface.texels, coverage, groups, estimate)
     return ClippedLight(
         lit=_with_estimates(lit, groups, estimate), groups=groups, estimate=estimate
     )
