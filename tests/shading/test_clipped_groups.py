@@ -128,6 +128,21 @@ def test_what_nobody_saw_beside_a_lamp_in_a_wall_is_part_of_it(world: World, own
     np.testing.assert_allclose(times[0] * grown, [9, 4.5, 2.25])
 
 
+def test_texels_across_a_chart_s_edge_make_a_lamp_no_larger(world: World, own):
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
+    wall = own(WALL).reshape(32, 32)
+    lamp, beside = wall[8:16, 24:30].ravel(), wall[8:16, 30:]
+    lit[lamp] = BOUND
+    interior = np.ones(len(lit), bool)
+    interior[wall[:, 31]] = False
+    edged = World(scene=world.scene, texels=replace(world.texels, interior=interior))
+    found, times = _told(edged, lit, lamp, wall[:, 30:].ravel())
+    grown = np.flatnonzero(found.group == 0)
+    assert set(beside[2:-2].ravel()) <= set(grown)
+    assert times[0, 0] == pytest.approx(9 * len(lamp) / interior[grown].sum())
+    assert not interior[grown].all()
+
+
 def test_only_lamps_that_are_determined_and_bright_enough_go_on_beside(world: World, own):
     lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
     wall = own(WALL).reshape(32, 32)

@@ -194,7 +194,9 @@ def lamps_with_unseen(
         own = np.arange(*texels.of_object(int(groups.object[k])).indices(len(texels)))
         part, free = np.flatnonzero(group == k), own[~coverage.observed[own] & (group[own] < 0)]
         with_unseen = _with_unseen(texels, part, own[coverage.observed[own]], free)
-        seen = texels.area[part].sum() / max(float(texels.area[with_unseen].sum()), 1e-30)
+        # Those at the border of a chart lie beyond its edge in part.
+        area = np.where(texels.interior, texels.area, 0)
+        seen = area[part].sum() / max(float(area[with_unseen].sum()), 1e-30)
         if multiplier[k].max() * seen >= 1:
             group[with_unseen], multiplier[k] = k, multiplier[k] * seen
     return replace(groups, group=group), replace(estimate, multiplier=multiplier)
