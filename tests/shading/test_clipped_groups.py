@@ -53,7 +53,10 @@ def _told(world: World, lit: np.ndarray, clipped: np.ndarray, unseen, times=9.0,
         determined=np.full(len(groups), determined),
     )
     coverage = _coverage(lit, clipped, unseen)
-    groups, told = lamps_with_unseen(world.texels, coverage, groups, told)
+    area = world.texels.area * world.texels.interior
+    groups, told = lamps_with_unseen(
+        world.texels, coverage, groups, told, lambda shines: float(area[shines].sum())
+    )
     return groups, told.multiplier
 
 
@@ -128,7 +131,7 @@ def test_what_nobody_saw_beside_a_lamp_in_a_wall_is_part_of_it(world: World, own
     np.testing.assert_allclose(times[0] * grown, [9, 4.5, 2.25])
 
 
-def test_texels_across_a_chart_s_edge_make_a_lamp_no_larger(world: World, own):
+def test_what_texels_bring_tells_how_much_larger_a_lamp_is(world: World, own):
     lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
     wall = own(WALL).reshape(32, 32)
     lamp, beside = wall[8:16, 24:30].ravel(), wall[8:16, 30:]

@@ -8,7 +8,7 @@ its light tell better (``lamp_light``).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -184,19 +184,26 @@ def _with_unseen(texels: Texels, part: Long, observed: Long, unseen: Long) -> Lo
 
 
 def lamps_with_unseen(
-    texels: Texels, coverage: CoverageMap, groups: ClippedGroups, estimate: EstimatedRadiance
+    texels: Texels,
+    coverage: CoverageMap,
+    groups: ClippedGroups,
+    estimate: EstimatedRadiance,
+    brought: Callable[[Bool], float],
 ) -> tuple[ClippedGroups, EstimatedRadiance]:
     """The groups and what they are told to send, the lamps among them that are determined with what
     nobody saw beside them: one that is seen in part would otherwise be as much too bright as it is
-    too small. Their power stays, and none falls below its bound for that."""
+    too small. What they bring stays, by what texels (T,) of one radiance ``brought``, and none
+    falls below its bound for that."""
     group, multiplier = groups.group.copy(), estimate.multiplier.copy()
     for k in np.flatnonzero(groups.lamp & estimate.determined):
         own = np.arange(*texels.of_object(int(groups.object[k])).indices(len(texels)))
         part, free = np.flatnonzero(group == k), own[~coverage.observed[own] & (group[own] < 0)]
         with_unseen = _with_unseen(texels, part, own[coverage.observed[own]], free)
-        # Those at the border of a chart lie beyond its edge in part.
-        area = np.where(texels.interior, texels.area, 0)
-        seen = area[part].sum() / max(float(area[with_unseen].sum()), 1e-30)
+        if len(with_unseen) == len(part):
+            continue
+        every = np.arange(len(texels))
+        of_part, of_all = (brought(np.isin(every, some)) for some in (part, with_unseen))
+        seen = of_part / max(of_all, 1e-30)
         if multiplier[k].max() * seen >= 1:
             group[with_unseen], multiplier[k] = k, multiplier[k] * seen
     return replace(groups, group=group), replace(estimate, multiplier=multiplier)
@@ -283,7 +290,14 @@ def estimate_clipped_light(
     found = dict(run.checkpoint("clipped", compute))
     groups = groups.with_walls(found.pop("wall"))
     estimate = EstimatedRadiance(**found)
-    groups, estimate = lamps_with_unseen(surface.texels, coverage, groups, estimate)
+
+    def brought(shines: Bool) -> float:
+        light = Shining.of(surface, np.repeat(shines[:, None], 3, axis=1).astype(np.float32))
+        chosen, _ = _chosen(surface.texels, groups, coverage.measured, seed)
+        outside = black_environment()
+        return float(irradiance_of_texels(surface, light, outside, chosen, seed).sum())
+
+    groups, estimate = lamps_with_unseen(surface.texels, coverage, groups, estimate, brought)
     return ClippedLight(
         lit=_with_estimates(lit, groups, estimate), groups=groups, estimate=estimate
     )
