@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from types import MappingProxyType
 
 import numpy as np
@@ -201,9 +202,10 @@ def lamps_with_unseen(
         with_unseen = _with_unseen(texels, part, own[coverage.observed[own]], free)
         if len(with_unseen) == len(part):
             continue
-        every = np.arange(len(texels))
-        of_part, of_all = (brought(np.isin(every, some)) for some in (part, with_unseen))
-        seen = of_part / max(of_all, 1e-30)
+        shines = group == k
+        of_part = brought(shines)
+        shines[with_unseen] = True
+        seen = of_part / max(brought(shines), 1e-30)
         if multiplier[k].max() * seen >= 1:
             group[with_unseen], multiplier[k] = k, multiplier[k] * seen
     return replace(groups, group=group), replace(estimate, multiplier=multiplier)
@@ -290,12 +292,13 @@ def estimate_clipped_light(
     found = dict(run.checkpoint("clipped", compute))
     groups = groups.with_walls(found.pop("wall"))
     estimate = EstimatedRadiance(**found)
+    # Hardly a scan has a lamp to ask them of.
+    asked = cache(partial(_chosen, surface.texels, groups, coverage.measured, seed))
 
     def brought(shines: Bool) -> float:
         light = Shining.of(surface, np.repeat(shines[:, None], 3, axis=1).astype(np.float32))
-        chosen, _ = _chosen(surface.texels, groups, coverage.measured, seed)
-        outside = black_environment()
-        return float(irradiance_of_texels(surface, light, outside, chosen, seed).sum())
+        dark, (chosen, _) = black_environment(), asked()
+        return float(irradiance_of_texels(surface, light, dark, chosen, seed).sum())
 
     groups, estimate = lamps_with_unseen(surface.texels, coverage, groups, estimate, brought)
     return ClippedLight(

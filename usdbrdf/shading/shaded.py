@@ -412,14 +412,15 @@ def _doubt(
     that no frame shows, weighed by their power, and what is outside. All lamps, measured ones and
     the sky too, send at least what ``measured`` surfaces do not send on of S, ``irradiance``
     (T, 3): the sky falls on the outside of walls too, which lights nothing that was measured."""
-    lamps = np.flatnonzero(light.groups.lamp & light.estimate.determined)
-    known = (
-        (float(light.estimate.standard_error[k].max()), light.groups.group == k) for k in lamps
-    )
-    guessed = zip(unseen.error.tolist(), unseen.object.tolist(), strict=True)
-    known_unseen = ((error, texels.object_index() == number) for error, number in guessed)
+    clipped, owner = light.groups, texels.object_index()
+    lamps = [
+        (float(light.estimate.standard_error[k].max()), clipped.group == k)
+        for k in np.flatnonzero(clipped.lamp & light.estimate.determined)
+    ]
+    numbers = zip(unseen.error.tolist(), unseen.object.tolist(), strict=True)
+    lamps += [(error, owner == number) for error, number in numbers]
     power, doubt, inferred = 0.0, 0.0, np.zeros(len(texels.area), np.bool_)
-    for error, own in (*known, *known_unseen):
+    for error, own in lamps:
         one = float(texels.area[own] @ light.lit[own].mean(axis=1))
         power, doubt, inferred = power + one, math.hypot(doubt, error * one), inferred | own
     kept = np.maximum(irradiance / np.pi - light.lit, 0).mean(axis=1)
