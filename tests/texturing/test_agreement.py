@@ -125,7 +125,7 @@ def test_a_mesh_of_another_unit_is_told(capture, factors, named, capsys):
     assert named in err
     if factors[0] == 1 / 0.3048:
         differ = float(re.search(r"\(differ by (\d+)%", err)[1]) / 100
-        assert not is_doubtful(Agreement(0.1, differ, 1000, differ, 0.0, 0.5))
+        assert not is_doubtful(Agreement(0.1, differ, 1000, 0.0, 0.5))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -189,10 +189,10 @@ def test_of_photographs_the_pixels_that_points_lie_in_are_looked_at_alone():
 def test_few_samples_say_nothing():
     assert agreement(np.full((100, 4), np.nan, np.float32)) is None
     assert agreement(np.zeros((100, 4), np.float32)) is None
-    good, bad = Agreement(0.05, 0.1, 5000, 0.1, 0, 1.0), Agreement(0.5, 0.9, 5000, 0.9, 0, 1.0)
+    good, bad = Agreement(0.05, 0.1, 5000, 0, 0.5), Agreement(0.5, 0.9, 5000, 0, 0.55)
     assert other_convention(bad, {"a": bad, "b": good, "c": None}) == "b"
     assert other_convention(bad, {"b": good._replace(samples=900)}) == ""
-    assert other_convention(bad, {"a": bad._replace(ratio=0.8, inside=0.8)}) == ""
+    assert other_convention(bad, {"a": bad._replace(ratio=0.8, scatter=0.44)}) == ""
     assert other_convention(None, {"b": good}) == "b"
 
 
@@ -268,7 +268,7 @@ def test_some_frames_are_judged_by_all():
 
 def test_another_reading_must_be_clearly_better_good_and_see_as_much():
     def of(ratio: float, samples: int = 1000) -> Agreement:
-        return Agreement(0.1, ratio, samples, ratio, 0.0, 0.5)
+        return Agreement(0.5 * ratio, ratio, samples, 0.0, 0.5)
 
     given = of(0.9)
     assert is_doubtful(given)
@@ -320,8 +320,8 @@ def test_readings_that_differ_by_chance_are_no_better():
         assert found.error == pytest.approx(found.ratio * math.sqrt(1 / points - 1e-3), rel=1e-3)
         return found
 
-    few = on_edge(12)._replace(ratio=0.12, inside=0.12, error=0.12 / math.sqrt(12))
-    fewer = on_edge(6)._replace(ratio=0.06, inside=0.06, error=0.06 / math.sqrt(6))
+    few = on_edge(12)._replace(ratio=0.12, scatter=0.12, error=0.12 / math.sqrt(12))
+    fewer = on_edge(6)._replace(ratio=0.06, scatter=0.06, error=0.06 / math.sqrt(6))
     assert other_convention(few, {"turned": fewer}) == ""
     assert other_convention(on_edge(300), {"turned": on_edge(150)}) == "turned"
     # The chance is small enough, but so is what frames differ by.
@@ -389,8 +389,8 @@ def test_a_camera_sees_what_faces_it_within_its_picture_and_is_not_hidden():
 
 def test_frames_that_show_a_spot_each_agree_about_nothing():
     """As of a plain room from so far that all of its mesh lies in a pixel of each frame."""
-    given = Agreement(0.1, 0.2, 5000, 0.2, 0.0, 0.5)
-    near, spot = (Agreement(0.0, 0.0, 5000, 0.0, 0.0, variety) for variety in (0.4, 1e-7))
+    given = Agreement(0.1, 0.2, 5000, 0.0, 0.5)
+    near, spot = (Agreement(0.0, 0.0, 5000, 0.0, variety) for variety in (0.4, 1e-7))
     assert other_convention(given, {"near": near}) == "near"
     assert other_convention(given, {"spot": spot}) == ""
     assert other_convention(None, {"near": near}) == "near"

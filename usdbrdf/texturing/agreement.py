@@ -112,8 +112,6 @@ class Agreement(NamedTuple):
     ratio    as a share of how much all samples differ: about 0 where all is well, about 1 where the
              poses tell nothing
     samples  how many were compared
-    inside   as a share of how much samples of one frame differ: about 1 too where all that frames
-             see is a spot
     error    standard error of the ratio, by which points were asked
     variety  how much samples of one frame differ, as a natural logarithm
     """
@@ -121,9 +119,13 @@ class Agreement(NamedTuple):
     scatter: float
     ratio: float
     samples: int
-    inside: float
     error: float
     variety: float
+
+    @property
+    def inside(self) -> float:
+        """The scatter as a share of the variety: about 1 too where all that frames see is a spot."""
+        return self.scatter / max(self.variety, 1e-6)
 
 
 def agreement(logarithm: Float, judged: Bool | None = None) -> Agreement | None:
@@ -150,9 +152,7 @@ def agreement(logarithm: Float, judged: Bool | None = None) -> Agreement | None:
     error = float(np.sqrt((by_point**2).sum()) / samples)
     level = value[known[rows]]
     spread = max(float(np.abs(level - np.median(level)).mean()), 1e-6)
-    variety = _spread_in_frames(value)
-    inside = scatter / max(variety, 1e-6)
-    return Agreement(scatter, scatter / spread, samples, inside, error / spread, variety)
+    return Agreement(scatter, scatter / spread, samples, error / spread, _spread_in_frames(value))
 
 
 def _spread_in_frames(value: Double) -> float:
@@ -165,7 +165,7 @@ def _spread_in_frames(value: Double) -> float:
 def other_convention(given: Agreement | None, others: Mapping[str, Agreement | None]) -> str:
     """The one of ``others``, readings of the poses by name, under which frames clearly agree while
     they hardly do as the poses are ``given``; "" where there is none."""
-    given = given or Agreement(1.0, 1.0, _FEWEST, 1.0, 0.0, 0.0)
+    given = given or Agreement(1.0, 1.0, _FEWEST, 0.0, 0.0)
     if given.ratio < _PLAIN:
         return ""
 
