@@ -124,7 +124,7 @@ class Agreement(NamedTuple):
 
     @property
     def inside(self) -> float:
-        """The scatter as a share of the variety: about 1 too where all that frames see is a spot."""
+        """The scatter as a share of the variety: about 1 too where frames see a spot each."""
         return self.scatter / max(self.variety, 1e-6)
 
 
