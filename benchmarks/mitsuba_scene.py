@@ -88,10 +88,12 @@ def mend(folder: Path, parent: ET.Element, child: ET.Element) -> None:
     elif child.tag == "bsdf" and kind in ("phong", "ward"):
         print(f"rough plastic: {kind} {child.get('id', '')}")
         make_plastic(child)
-    elif child.tag == "emitter" and kind in ("sky", "sunsky") and child.find("transform") is None:
+    elif child.tag == "emitter" and kind in ("sky", "sunsky"):
         # Up was y; now it is z, but where the sun stands is said in the world as before.
-        turned = ET.SubElement(child, "transform", name="toWorld")
-        ET.SubElement(turned, "rotate", x="1", angle="-90")
+        turned = child.find("transform")
+        if turned is None:
+            turned = ET.SubElement(child, "transform", name="toWorld")
+        turned.insert(0, ET.Element("rotate", x="1", angle="-90"))
     if child.tag == "bsdf" and child.get("type") in SOLID and parent.tag in ("scene", "shape"):
         inner = ET.Element("bsdf", type=child.get("type", ""))
         inner.extend(list(child))
@@ -115,7 +117,7 @@ def make_plastic(bsdf: ET.Element) -> None:
 
 
 def world_mesh(things: list[mi.Shape], scale: float) -> Scene:
-    """All shapes as triangles, in metres; rectangles and spheres are made of some."""
+    """All shapes as triangles, in metres; rectangles, spheres and disks are made of some."""
     points, triangles = [], []
     for thing in things:
         p, f = triangles_of(thing)
@@ -145,6 +147,11 @@ def triangles_of(thing: mi.Shape) -> tuple[Double, np.ndarray]:
     elif kind == "Sphere":
         ball = trimesh.creation.icosphere(subdivisions=4)
         own, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    elif kind == "Disk":
+        turn = np.linspace(0, 2 * np.pi, 65)[:-1]
+        rim = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+        own, at = np.concatenate([rim, np.zeros((1, 3))]), np.arange(64)
+        faces = np.stack([at, (at + 1) % 64, np.full(64, 64)], axis=1)
     else:
         raise SystemExit(f"a shape is a {kind}. Export it as triangles.")
     matrix = np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
