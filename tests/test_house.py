@@ -162,6 +162,7 @@ ENGINEERING: dict[str, str] = {
     "DARK": "codes of what a texel shows in a frame",
     "DARK_CODE": "codes of 8-bit images",
     "FIRST_RAYS": "rays: noise against time",
+    "GLIMPSE": "codes of what a texel shows in a frame",
     "GRID": "discretisation of the search",
     "HEIGHT": "pixels of a picture",
     "LARGEST_OF_POSE": "limit of what is refused",

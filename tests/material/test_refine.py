@@ -36,6 +36,7 @@ from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
 from usdbrdf.shading import shaded
 from usdbrdf.shading.asked import Shining, irradiance_of_texels
+from usdbrdf.shading.base_color import base_color_of
 from usdbrdf.shading.hidden_light import beside_seen
 from usdbrdf.texturing.robust_mean import RobustMean
 from usdbrdf.transport.brdf import DIELECTRIC, PAPER
@@ -384,6 +385,37 @@ def test_what_is_too_dark_for_a_sample_stays_dark(room: Room):
     diffuse, _, error = refine._diffuse_of_means(lighting, found, lobes)
     np.testing.assert_allclose(diffuse[dark], 1e-5, rtol=1e-3)
     assert np.isinf(error[dark]).all()
+
+
+def test_what_is_only_glimpsed_keeps_what_it_shows(room: Room):
+    """The box, as if no frame had seen it alone: its texels tell no more than that."""
+    atlas = room.clean
+    box = atlas.texels.object_index() == next(
+        i for i, item in enumerate(atlas.scene.objects) if item.label == "box"
+    )
+    measured = atlas.coverage.measured
+    coverage = CoverageMap.of(measured & ~box, atlas.coverage.clipped, measured & box)
+    before = SimpleNamespace(
+        lit=atlas.lit, emission=atlas.emission, emissive=atlas.emissive, coverage=coverage,
+        irradiance=atlas.irradiance,
+    )  # fmt: skip
+    lobes, lighting = _lobes(atlas), Lighting("", atlas.lit_scene(black_environment()), before, ())
+    level = refined_means.level_of(atlas.lit)[:, None]
+    mean = np.where(coverage.measured[:, None], atlas.lit / level, np.nan).astype(np.float32)
+    flat, beside = np.zeros(len(mean), np.float32), np.zeros((len(mean), 3), np.float32)
+    found = RobustMean(mean, flat, beside, beside + 1)
+    told = refine._diffuse_of_means(lighting, found, lobes)
+    own = coverage.glimpsed
+    assert own.sum() > 20
+    np.testing.assert_allclose(told.diffuse[own], atlas.lit[own], rtol=1e-4)
+    np.testing.assert_allclose(told.in_own_light[own], atlas.lit[own], rtol=1e-4)
+    assert (told.error[own] == 1).all()
+    shown = refine._reflection(lighting, told, atlas.irradiance)
+    base_color = base_color_of(atlas.texels, [shown])[box]
+    true = np.pi * atlas.lit[own] / atlas.irradiance[own]
+    np.testing.assert_allclose(
+        np.median(base_color, axis=0), np.median(np.clip(true, 0, 1), axis=0), rtol=0.2
+    )
 
 
 def test_tiles_do_not_show(room: Room, tmp_path: Path, monkeypatch):

@@ -20,30 +20,39 @@ from usdbrdf.shading.clipped_light import (
     _with_estimates,
     estimate_clipped_light,
 )
-from usdbrdf.transport.environment import black_environment
+from usdbrdf.transport.environment import Environment, Sun, black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lit_scene import TexturedScene
+from usdbrdf.transport.sunlight import sunlight
 from usdbrdf.transport.tile_draws import independent_tiles
 
+NO_LIGHT = black_environment()
 ALBEDO = [(0.5, 0.4, 0.3), (0.8, 0.8, 0.8), (0.6, 0.6, 0.7), (0.7, 0.3, 0.2), (0.4, 0.5, 0.7)]
 ALBEDO += [(0.6, 0.6, 0.6)]
 LAMPS = [(12.0, 10.0, 7.0), (5.0, 5.5, 6.5)]
 SATURATION = 3.0
 
 
-def _shone(world: World, albedo: np.ndarray, emitted: np.ndarray, bounces: int) -> np.ndarray:
+def _shone(
+    world: World,
+    albedo: np.ndarray,
+    emitted: np.ndarray,
+    bounces: int,
+    environment: Environment = NO_LIGHT,
+) -> np.ndarray:
     """L_d (T, 3) after some bounces, with noise of each texel's own, as pictures have it."""
     order, _ = tiles_of_texels(world.texels)
     tile = independent_tiles(len(order))
+    surface = TexturedScene(world.scene, world.texels, world.rays)
     lit = emitted
     for bounce in range(bounces):
         found = irradiance_at(
-            world.rays, world.texture(lit), world.lights(lit), black_environment(),
+            world.rays, world.texture(lit), world.lights(lit), environment,
             world.texels.position[order], world.texels.normal[order], tile,
             Sampling(standard_error=0.01, max_rays=512, seed=bounce), world.size,
         )  # fmt: skip
         irradiance = np.empty_like(lit)
-        irradiance[order] = found.mean
+        irradiance[order] = found.mean + sunlight(surface, order, environment.sun, bounce)
         lit = (emitted + albedo * irradiance / np.pi).astype(np.float32)
     return lit
 
@@ -67,13 +76,19 @@ def truth(world: World) -> np.ndarray:
     return _shone(world, albedo, emitted, bounces=5)
 
 
-def _estimated(world: World, lit: np.ndarray, clipped: np.ndarray, folder: Path) -> ClippedLight:
+def _estimated(
+    world: World,
+    lit: np.ndarray,
+    clipped: np.ndarray,
+    folder: Path,
+    environment: Environment = NO_LIGHT,
+) -> ClippedLight:
     eyes = [np.array(eye) for eye in ((0.4, 0.4, 1.5), (3.6, 2.6, 1.5), (0.4, 2.6, 1.2))]
     frames = frames_at([look_at(eye, np.array([2.0, 1.5, 1.0])) for eye in eyes])
     surface = TexturedScene(world.scene, world.texels, world.rays)
     run = TaskRun(folder, "shade", folder / "work")
     coverage = CoverageMap.of(~clipped, clipped)
-    return estimate_clipped_light(run, surface, lit, coverage, frames, black_environment(), 0)
+    return estimate_clipped_light(run, surface, lit, coverage, frames, environment, 0)
 
 
 def test_the_lamps_are_as_bright_as_their_light_says(
@@ -147,3 +162,37 @@ def test_what_nobody_saw_of_a_lamp_shines_only_if_the_lamp_is_determined():
     light = ClippedLight(lit=np.ones((5, 3), np.float32), groups=groups, estimate=estimate)
     clipped = np.array([False, True, False, True, False])
     np.testing.assert_array_equal(light.may_shine(clipped), [False, True, True, True, False])
+
+
+def test_what_stands_in_the_sun_is_not_the_light_of_the_lamp_beside_it(tmp_path: Path):
+    """Through a hole in the ceiling the sun falls on a table, object 9, which clips at a tenth of
+    what it sends; beside it lies a lamp, object 10, that clips too and sends little."""
+    parts = room((0, 0, 0), (4, 3, 2.5), size=(16, 16))
+    around = [
+        quad((0, 0, 2.5), (0, 3, 0), (1.7, 0, 0), size=(16, 16)),
+        quad((2.3, 0, 2.5), (0, 3, 0), (1.7, 0, 0), size=(16, 16)),
+        quad((1.7, 0, 2.5), (0, 1.2, 0), (0.6, 0, 0), size=(8, 8)),
+        quad((1.7, 1.8, 2.5), (0, 1.2, 0), (0.6, 0, 0), size=(8, 8)),
+    ]
+    walls = [part for part in parts if not (part.points[:, 2] > 2.4).all()]
+    assert len(walls) == 5
+    table = quad((1.5, 1.0, 0.9), (1.0, 0, 0), (0, 1.0, 0), size=(12, 12))
+    lamp = quad((2.7, 1.1, 0.9), (0.8, 0, 0), (0, 0.8, 0))
+    world = world_of([*walls, *around, table, lamp])
+    sun = Sun(np.array([0.0, 0.0, 1.0]), np.full(3, 100.0))
+    noon = Environment(np.zeros((1, 1, 3), np.float32), True).under(sun)
+    dark = [(0.0, 0.0, 0.0)]
+    albedo = world.per_object([*ALBEDO[:5], *[(0.8, 0.8, 0.8)] * 4, (0.9, 0.9, 0.9), *dark])
+    rng = np.random.default_rng(5)
+    albedo = (albedo * np.exp(0.03 * rng.standard_normal((len(albedo), 1)))).astype(np.float32)
+    emitted = world.per_object([*dark * 10, (8.0, 8.0, 8.0)])
+    true = _shone(world, albedo, emitted, 4, noon)
+    clipped = (true >= SATURATION).any(axis=1)
+    owner = world.texels.object_index()
+    assert set(owner[clipped].tolist()) == {9, 10}
+    lit = np.where(clipped[:, None], np.float32(SATURATION), true)
+    light = _estimated(world, lit, clipped, tmp_path, noon)
+    assert light.groups.object[light.groups.lamp].tolist() == [10]
+    assert light.estimate.determined[light.groups.lamp].all()
+    found = light.lit[world.texels.of_object(10)].mean(axis=0)
+    np.testing.assert_allclose(found, 8, rtol=0.25)

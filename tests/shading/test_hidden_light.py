@@ -130,6 +130,24 @@ def test_what_was_seen_and_what_shines_stay_as_they_were(by_lamp):
     np.testing.assert_array_equal(found[back], filled[back])
 
 
+def test_what_is_only_glimpsed_tells_what_the_rest_of_it_reflects(by_lamp):
+    """The table is seen in no pixels of its own: without them it would be grey underneath."""
+    world, true, filled, hidden = by_lamp
+    owner = world.texels.object_index()
+    table, none = owner == TABLE, np.zeros(len(hidden), bool)
+    coverage = CoverageMap.of(~hidden & ~table, none, ~hidden & table)
+    surface = TexturedScene(world.scene, world.texels, world.rays)
+    lamps = KnownLamps(owner == LAMP, {})
+    found = light_of_hidden(surface, filled, coverage, black_environment(), 3, lamps)
+    under = hidden & table
+    np.testing.assert_array_equal(found[~hidden], filled[~hidden])
+    np.testing.assert_allclose(found[under].mean(axis=0), true[under].mean(axis=0), rtol=0.1)
+    unseen = CoverageMap.of(~hidden & ~table, none)
+    grey = light_of_hidden(surface, filled, unseen, black_environment(), 3, lamps)
+    off = np.abs(grey[under].mean(axis=0) / true[under].mean(axis=0) - 1)
+    assert off.max() > 0.2
+
+
 def test_what_clips_reflects_what_it_receives_and_no_less_than_it_shows(by_lamp):
     world, true, filled, hidden = by_lamp
     owner, top = world.texels.object_index(), (world.texels.normal[:, 2] > 0.9) & ~hidden

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,7 @@ def _measured(count, clipped, median=None, bound=None) -> Measured:
         count=np.asarray(count, np.int32),
         clipped=np.asarray(clipped, np.int32),
         lower_bound=np.zeros(number, np.float32) if bound is None else bound,
+        glimpsed=np.zeros(number, bool),
         probes=np.zeros((0, 1), np.float32),
     )  # fmt: skip
 
@@ -84,6 +87,31 @@ def test_a_neighbours_pixels_are_no_bounds_of_an_object(trio: World):
     np.testing.assert_allclose(found.lit[OWN], 50)
     np.testing.assert_allclose(found.lit[OWN + 1 : 2 * OWN], 2, rtol=1e-5)
     np.testing.assert_allclose(found.mean[OWN : 2 * OWN], 6, rtol=1e-5)
+
+
+def test_a_thing_too_thin_to_be_measured_is_known_by_glimpses(trio: World):
+    """The first is measured, and glimpsed beside that; the second only glimpsed, in part; the third
+    clips, as a lamp does, with glimpses of its rim."""
+    count, clipped = np.zeros(3 * OWN, int), np.zeros(3 * OWN, int)
+    count[: OWN // 2], clipped[2 * OWN : 2 * OWN + 40] = 3, 2
+    glimpsed = np.zeros(3 * OWN, bool)
+    glimpsed[OWN // 2 : OWN + OWN // 4] = glimpsed[2 * OWN + 40 :] = True
+    told = _measured(count, clipped, bound=np.where(clipped > 0, 9, 0).astype(np.float32))
+    own = np.where(glimpsed[:, None], np.float32(0.5), told.median)
+    told = replace(told, median=own, mean=np.where(glimpsed[:, None], own, told.mean))
+    found = _filled_in(trio.texels, replace(told, glimpsed=glimpsed), {})
+    np.testing.assert_allclose(found.lit[:OWN], 2, rtol=1e-5)
+    np.testing.assert_allclose(found.lit[OWN : 2 * OWN], 0.5, rtol=1e-5)
+    np.testing.assert_allclose(found.mean[OWN : 2 * OWN], 0.5, rtol=1e-5)
+    np.testing.assert_allclose(found.lit[2 * OWN :], 9, rtol=1e-5)
+    assert np.flatnonzero(found.coverage.glimpsed).tolist() == [*range(OWN, OWN + OWN // 4)]
+    assert not (found.coverage.glimpsed & found.coverage.observed).any()
+    assert (found.samples[OWN : 2 * OWN] == 0).all()
+    assert (found.spread[OWN : 2 * OWN] == 0).all()
+    stored = found.coverage.stored()
+    assert set(stored.tolist()) == {0, 0.25, 0.5, 1}
+    again = CoverageMap.from_stored(np.repeat(stored[:, None], 3, axis=1))
+    np.testing.assert_array_equal(again.kind, found.coverage.kind)
 
 
 def test_a_scan_of_which_nothing_is_seen_is_refused_with_its_texels_size(trio: World):

@@ -18,7 +18,7 @@ from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.geometry.unwrap import pack_triangles_singly
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.exposures import Probes
-from usdbrdf.texturing.observe import Observation, samples_from_frames, spread_order
+from usdbrdf.texturing.observe import FrameSamples, Observation, samples_from_frames, spread_order
 from usdbrdf.texturing.psquare import quantile
 from usdbrdf.transport.lit_scene import TexturedScene
 
@@ -220,3 +220,35 @@ def test_a_film_is_read_so_that_neighbours_do_not_follow_each_other(count: int):
     assert sorted(order) == list(range(count))
     apart = np.abs(np.diff(order)) if count > 3 else np.array([count])
     assert apart.min() >= 0.2 * count
+
+
+def _frame_of(texel: list[int], radiance: list[float], *, glimpses: bool) -> FrameSamples:
+    none, colours = np.zeros(0, np.int32), np.zeros((0, 3), np.float32)
+    own = np.array(texel, np.int32), np.repeat(np.array(radiance, np.float32)[:, None], 3, axis=1)
+    sampled, glimpsed = ((none, colours), own) if glimpses else (own, (none, colours))
+    return FrameSamples(0, *sampled, none, 9.0, none, colours, 0.1, *glimpsed)
+
+
+def test_a_sample_is_worth_more_than_all_glimpses():
+    """Texel 10 is only glimpsed, 11 sampled before and after, 12 only sampled, 13 not at all."""
+    part = slice(10, 14)
+    observed, plain = (Observation.empty(part, Probes.empty(20, 9, part)) for _ in range(2))
+    for k in range(5):
+        observed.add(_frame_of([10, 11], [1.0 + k, 50.0], glimpses=True), 0.5)
+    saved = {name: values.copy() for name, values in observed.arrays().items()}
+    observed = Observation.empty(part, Probes.empty(20, 9, part))
+    observed.restore(saved)
+    for k in range(6):
+        sampled = _frame_of([11, 12], [2.0 + k, 3.0 + k], glimpses=False)
+        observed.add(sampled, 0.5)
+        plain.add(sampled, 0.5)
+        observed.add(_frame_of([11, 12], [80.0, 80.0], glimpses=True), 0.5)
+    found, alone = observed.measured(0.5), plain.measured(0.5)
+    assert found["glimpsed"].tolist() == [True, False, False, False]
+    assert found["count"].tolist() == [0, 6, 6, 0]
+    np.testing.assert_allclose(found["median"][0], 3.0)
+    np.testing.assert_allclose(found["mean"][0], 3.0)
+    assert np.isnan(found["spread"][0]).all()
+    for name in ("median", "mean", "spread", "count"):
+        np.testing.assert_array_equal(found[name][1:3], alone[name][1:3])
+    assert np.isnan(found["median"][3]).all()

@@ -13,6 +13,7 @@ from tests.scenes import camera_at, look_at
 from usdbrdf.texturing.samples import (
     CLIPPED,
     DARK,
+    GLIMPSE,
     NOTHING,
     SAMPLE,
     Picture,
@@ -342,3 +343,42 @@ def test_a_point_beside_a_texel_is_projected_as_by_its_camera():
         assert depth == pytest.approx((camera.eye - point) @ camera.world_from_camera[:3, 2])
     behind = np.float32(camera.eye + camera.world_from_camera[:3, 2])
     assert project(behind, sx, sy, 0.0, 0.0, Projection.of(camera)) == (0, 0, -1)
+
+
+def test_a_thin_bar_is_glimpsed_and_only_by_whom_asks(plane: World):
+    """Half a pixel wide, before a plane: no 3 x 3 pixels show it alone."""
+    bar = quad((-0.006, -0.5, 0.1), (0.012, 0, 0), (0, 1, 0), size=(2, 60))
+    world = world_of([quad((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0), size=(40, 40)), bar])
+    pose = _camera()
+    camera = camera_at(pose, LENS, WIDTH, HEIGHT)
+    surfaces = first_surfaces(world.rays, world.scene.face_object, camera)
+    image = np.where(surfaces.object[..., None] == 1, [0.5, 0.25, 1.0], [2.0, 2.0, 2.0])
+    image[:, :, 0] += np.arange(WIDTH) / 100  # each column differs
+    image, valid = image.astype(np.float32), np.ones((HEIGHT, WIDTH), bool)
+    valid[20:30] = False
+    dark = np.zeros((HEIGHT, WIDTH), bool)
+    owner = world.texels.object_index()
+    given = world.texels, owner, surfaces, Picture(image, valid, dark, dark), camera
+    plain, _ = samples_from_frame(*given)
+    kind, radiance = samples_from_frame(*given, glimpses=True)
+    own = owner == 1
+    assert (plain[own] == NOTHING).all()
+    assert set(kind[own].tolist()) == {NOTHING, GLIMPSE}
+    np.testing.assert_array_equal(kind[(plain != NOTHING)], plain[(plain != NOTHING)])
+    column, row = (
+        np.floor(part).astype(int) for part in _pixel_of(pose, world.texels.position[own])
+    )
+    there = (surfaces.object[row.clip(0, HEIGHT - 1), column] == 1) & (row >= 1) & (row <= 58)
+    expected = there & valid[row.clip(0, HEIGHT - 1), column]
+    assert expected.sum() > 20
+    assert (there & ~expected).any()
+    np.testing.assert_array_equal(kind[own] == GLIMPSE, expected)
+    np.testing.assert_array_equal(radiance[own][expected], image[row[expected], column[expected]])
+    # A lamp's light lies on the pixels beside it.
+    image[45:50][surfaces.object[45:50] == 0] = 200
+    beside, _ = samples_from_frame(
+        world.texels, owner, surfaces, Picture(image, valid, dark, dark), camera, glimpses=True
+    )
+    near = expected & (row >= 45) & (row < 50)
+    assert near.any()
+    assert (beside[own][near] == NOTHING).all()

@@ -172,7 +172,7 @@ def _reflection(lighting: Lighting, told: _Told, irradiance: Float) -> Reflectio
         radiance=told.in_own_light,
         irradiance=irradiance,
         error=told.error,
-        known=before.coverage.observed,
+        known=before.coverage.observed | before.coverage.glimpsed,
         emissive=before.emissive,
         bound=np.where(before.coverage.clipped, before.lit.min(axis=1), 0),
     )
@@ -191,16 +191,16 @@ def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> _T
     texels, before = lighting.lit.texels, lighting.before
     emissive, level = before.emissive, level_of(before.lit)
     known = np.isfinite(found.mean[:, 0]) & ~emissive
-    # Too dark for a sample in any frame: there is nothing to take off.
-    dark = before.coverage.measured & ~known & ~emissive
+    # Too dark for a sample in any frame, or only glimpsed: there is nothing to take off.
+    plain = before.coverage.tells_albedo & ~known & ~emissive
     clipped, metal = before.coverage.clipped, lobes.conducts[texels.object_index()] & ~emissive
 
     def restored_over(unit: Float, uneven: Float) -> Float:
         """Of what is measured in this ``unit`` (T, 3), of which pixels blurred nothing."""
-        shown = np.where(dark[:, None], before.lit, np.maximum(found.mean * level[:, None], 0))
+        shown = np.where(plain[:, None], before.lit, np.maximum(found.mean * level[:, None], 0))
         shown = np.where(known[:, None], shown * uneven, shown) / unit
         variance = found.variance * (level / unit.mean(axis=1)) ** 2
-        filled_in = inpaint(texels, np.asarray(shown, np.float32), known | dark)
+        filled_in = inpaint(texels, np.asarray(shown, np.float32), known | plain)
         diffuse = unit * restored(texels, filled_in, known, variance, found.footprint)
         diffuse = np.where(emissive[:, None], before.emission, np.maximum(diffuse, 0))
         # What clips in every frame is at least as bright as that.
@@ -212,6 +212,7 @@ def _diffuse_of_means(lighting: Lighting, found: RobustMean, lobes: Lobes) -> _T
     mixed, in_own_light = restored_over(one, found.uneven), restored_over(light_of(before), one)
     relative = np.maximum(found.mean.mean(axis=1), 1e-3)
     error = np.where(known, np.sqrt(found.variance) / relative, np.inf)
+    error[before.coverage.glimpsed] = 1  # as much of it may be something else's light
     return _Told(mixed, in_own_light, error.astype(np.float32))
 
 

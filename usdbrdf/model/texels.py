@@ -18,13 +18,20 @@ from usdbrdf.model.arrays import Bool, Float, Int, Long
 
 
 class Coverage(IntEnum):
-    """FILLED: no frame shows the texel, its radiance is taken from around it; CLIPPED: frames show
-    it, every one of them saturated, so that its radiance is a lower bound; MEASURED: at least one
-    frame gives its radiance, or that it is too dark to be told from darkness."""
+    """FILLED: no frame shows the texel, its radiance is taken from around it; GLIMPSED: frames show
+    it in pixels that show something else as well, and its object hardly otherwise, as they do thin
+    bars: its radiance is about that; CLIPPED: frames show it, every one of them saturated, so that
+    its radiance is a lower bound; MEASURED: at least one frame gives its radiance, or that it is
+    too dark to be told from darkness."""
 
     FILLED = 0
-    CLIPPED = 1
-    MEASURED = 2
+    GLIMPSED = 1
+    CLIPPED = 2
+    MEASURED = 3
+
+
+# How the map "coverage" has them.
+_STORED = np.array([0, 0.25, 0.5, 1], np.float32)
 
 
 @dataclass(frozen=True)
@@ -34,19 +41,24 @@ class CoverageMap:
     kind: npt.NDArray[np.int8]
 
     @classmethod
-    def of(cls, measured: Bool, clipped: Bool) -> CoverageMap:
-        """measured, clipped (T,): a frame measured the texel; all that show it saturated."""
-        kinds = (Coverage.MEASURED, Coverage.CLIPPED)
-        return cls(np.select([measured, clipped], kinds, Coverage.FILLED).astype(np.int8))
+    def of(cls, measured: Bool, clipped: Bool, glimpsed: Bool | None = None) -> CoverageMap:
+        """measured, clipped, glimpsed (T,): a frame measured the texel; all that show it saturated;
+        frames show it, but not it alone (None: no such)."""
+        glimpsed = np.zeros_like(measured) if glimpsed is None else glimpsed
+        kinds = (Coverage.MEASURED, Coverage.CLIPPED, Coverage.GLIMPSED)
+        found = np.select([measured, clipped, glimpsed], kinds, Coverage.FILLED)
+        return cls(found.astype(np.int8))
 
     @classmethod
     def from_stored(cls, values: Float) -> CoverageMap:
         """The inverse of ``stored``."""
-        return cls(np.rint(values[:, 0] * Coverage.MEASURED).astype(np.int8))
+        between = (_STORED[1:] + _STORED[:-1]) / 2
+        return cls(np.digitize(values[:, 0], between).astype(np.int8))
 
     def stored(self) -> Float:
-        """(T,) float32 as the map "coverage" has it: 0 filled, 0.5 clipped, 1 measured."""
-        return self.kind.astype(np.float32) / np.float32(Coverage.MEASURED)
+        """(T,) float32 as the map "coverage" has it: 0 filled, 0.25 glimpsed, 0.5 clipped, 1
+        measured."""
+        return np.asarray(_STORED[self.kind], np.float32)
 
     @property
     def measured(self) -> Bool:
@@ -60,8 +72,18 @@ class CoverageMap:
 
     @property
     def observed(self) -> Bool:
-        """(T,): measured or clipped; a frame shows the texel."""
-        return np.asarray(self.kind != Coverage.FILLED, np.bool_)
+        """(T,): measured or clipped; a frame shows the texel alone."""
+        return np.asarray(self.kind >= Coverage.CLIPPED, np.bool_)
+
+    @property
+    def glimpsed(self) -> Bool:
+        """(T,): frames show the texel in pixels that show something else as well."""
+        return np.asarray(self.kind == Coverage.GLIMPSED, np.bool_)
+
+    @property
+    def tells_albedo(self) -> Bool:
+        """(T,): measured, or else glimpsed: what it reflects is known."""
+        return self.measured | self.glimpsed
 
 
 Number = TypeVar("Number", bound=np.generic)

@@ -34,7 +34,7 @@ STATUS_COLOURS = {
     "failed": (213, 94, 0),
     "lamp": (240, 228, 66),
 }
-_COVERAGE_COLOURS = ((150, 150, 150), (213, 94, 0), (0, 158, 115))
+_COVERAGE_COLOURS = ((150, 150, 150), (86, 180, 233), (213, 94, 0), (0, 158, 115))
 _BACKGROUND = np.array((40, 44, 52), np.uint8)
 
 
@@ -145,7 +145,8 @@ def surface_maps(atlas: AssetMaps, fits: Sequence[FittedObject | None]) -> Itera
     kinds = np.array(_COVERAGE_COLOURS, np.float32)[atlas.coverage.kind] / np.float32(255)
     yield SurfaceMap(
         name="coverage", title="Coverage", values=kinds, direct=True,
-        legend="Green: measured. Orange: clipped in every frame. Grey: no frame shows it; filled.",
+        legend="Green: measured. Orange: clipped in every frame. Blue: seen with what is "
+        "beside it alone. Grey: no frame shows it; filled.",
     )  # fmt: skip
     for name, title, relative, unit in (
         ("samples", "Samples", False, "frames per texel"),

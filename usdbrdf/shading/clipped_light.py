@@ -35,6 +35,7 @@ from usdbrdf.shading.clipped_emitters import (
     nothing_known,
 )
 from usdbrdf.shading.gloss import mirrored_to_frames
+from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
 from usdbrdf.shading.lamp_light import Lamps, looked_at_closely
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -80,6 +81,10 @@ class ClippedGroups:
     def texels_of(self, which: Bool) -> Bool:
         """(T,): the texels of those of the groups (K,)."""
         return np.asarray(np.append(which, False)[self.group], np.bool_)
+
+    def without(self, which: Bool) -> ClippedGroups:
+        """The same, but texels of those of the groups (K,) are of none."""
+        return replace(self, group=np.where(self.texels_of(which), np.int32(-1), self.group))
 
     def with_walls(self, which: Bool) -> ClippedGroups:
         """The same where those of the groups (K,) are no lamps."""
@@ -281,12 +286,15 @@ def estimate_clipped_light(
             least = np.where(by_hand, np.inf, least)
             given = surface, lit, coverage, frames, groups, least, environment, seed
             wall = reflects_other_light(*given)
-        left = groups.with_walls(wall)
+        left, light = groups.with_walls(wall), lit
         if wall.any():
-            first = estimate_clipped_emitters(
-                replace(evidence, prior=left.priors(), shines=left.lamp)
-            )
-        told = _told_by_even_light(surface, lit, coverage, frames, environment, left, first, seed)
+            # What the sun shines on may be many times its bound, which lamps beside it would send.
+            light = _reflecting(surface, lit, coverage, left, wall, environment, seed, said)
+            known = left.without(wall)
+            evidence = _evidence(surface, light, known, chosen, segment, environment, seed)
+            first = estimate_clipped_emitters(evidence)
+            left = replace(left, group=known.group)
+        told = _told_by_even_light(surface, light, coverage, frames, environment, left, first, seed)
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
@@ -350,6 +358,24 @@ def reflects_other_light(
         ratio = most.max(axis=1) / lit[one].max(axis=1)
         explained[k] = np.quantile(ratio, 1 - _SOME_EXPLAINED) > share * least[k]
     return explained
+
+
+def _reflecting(
+    surface: TexturedScene,
+    lit: Float,
+    coverage: CoverageMap,
+    groups: ClippedGroups,
+    wall: Bool,
+    environment: Environment,
+    seed: int,
+    said: Mapping[int, bool],
+) -> Float:
+    """``lit`` (T, 3) with what those of the groups (K,) that are walls reflect."""
+    owner = surface.texels.object_index()
+    told = np.isin(owner, [number for number, is_lamp in said.items() if is_lamp])
+    lamps = KnownLamps(told | groups.texels_of(groups.lamp), said)
+    light = light_of_hidden(surface, lit, coverage, environment, seed, lamps)
+    return np.where(groups.texels_of(wall)[:, None], light, lit)
 
 
 def _with_estimates(lit: Float, groups: ClippedGroups, estimate: EstimatedRadiance) -> Float:

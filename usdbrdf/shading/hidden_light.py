@@ -73,7 +73,8 @@ def with_hidden_light(
 ) -> Float:
     """``light_of_hidden`` from ``lit`` (T, 3), what is known of it, on; ``filled`` (T, 3) is L_d as
     texturing left it. What this changes is kept under ``name``."""
-    lamplit = np.where((coverage.observed | lamps.texel)[:, None], lit, filled)
+    shown = coverage.observed | coverage.glimpsed | lamps.texel
+    lamplit = np.where(shown[:, None], lit, filled)
 
     def compute() -> dict[str, Array]:
         light = light_of_hidden(surface, lamplit, coverage, environment, seed, lamps, lit)
@@ -94,11 +95,12 @@ def light_of_hidden(
     lamps: KnownLamps,
     start: Float | None = None,
 ) -> Float:
-    """(T, 3) W/(m^2 sr): ``lit``, L_d, and of texels that no frame measures what they reflect of it
-    and of the ``environment``, but for ``lamps``. start (T, 3): what is known of that before."""
-    texels, known = surface.texels, coverage.measured | lamps.texel
+    """(T, 3) W/(m^2 sr): ``lit``, L_d, and of texels that no frame measures or glimpses what they
+    reflect of it and of the ``environment``, but for ``lamps``. start (T, 3): what is known of that
+    before."""
+    texels, known = surface.texels, coverage.tells_albedo | lamps.texel
     every = np.flatnonzero(~known)
-    seen = _spread(texels, coverage.measured & ~lamps.texel)
+    seen = _spread(texels, coverage.tells_albedo & ~lamps.texel)
     # Apart, for of a small part that clips little is traced among all that hides.
     kinds = (~known & coverage.clipped, ~known & ~coverage.clipped)
     hidden = np.union1d(*(_spread(texels, kind) for kind in kinds))

@@ -461,7 +461,9 @@ def shade_surface(
     emitters = find_emitters(
         texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt
     )
-    albedo, over = albedo_map(texels, light.lit, irradiance, seen, emitters.emissive)
+    told = coverage.tells_albedo
+    albedo, over = albedo_map(texels, light.lit, irradiance, told, emitters.emissive)
+    over &= seen
     level = np.maximum(traced.mean.mean(axis=1), 1e-30)
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / level
     return Shaded(

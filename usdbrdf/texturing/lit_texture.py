@@ -33,7 +33,8 @@ class LitTexture:
     """Of T texels; radiance in W/(m^2 sr), linear Rec.709.
 
     lit, mean  (T, 3) float32: the quantile that was asked for and the mean of what frames measured,
-               filled in elsewhere; where all frames clip, at least what saturates them
+               or of an object that they hardly do, of what the pixels hold that show it; filled in
+               elsewhere; where all frames clip, at least what saturates them
     spread     (T, 3) float32: see ``psquare.spread``; 0 where not measured
     samples    (T,) float32: frames that measured the texel
     coverage   what is known of each texel
@@ -156,7 +157,8 @@ def _seen_by_frames(
 
 def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float]) -> LitTexture:
     """L_d and the mean everywhere: measured, or inpainted from what was measured on the same
-    object. An object that only ever clipped is known by those bounds alone."""
+    object. An object that only ever clipped is known by those bounds alone, and one too thin for
+    more by glimpses."""
     measured = found.count > 0
     clipped = ~measured & (found.clipped > 0)
     if not (measured | clipped).any():
@@ -168,19 +170,22 @@ def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float])
         )
     owner, count = texels.object_index(), len(texels.resolution)
     has_measured = np.bincount(owner, measured, count) > 0
-    has_bounds = np.bincount(owner, clipped, count) >= telling(np.bincount(owner, minlength=count))
+    enough = telling(np.bincount(owner, minlength=count))
+    has_bounds = np.bincount(owner, clipped, count) >= enough
     bounded = clipped & (~has_measured & has_bounds)[owner]
+    thin = (np.bincount(owner, measured, count) < enough) & ~has_bounds
+    glimpsed = found.glimpsed & ~clipped & thin[owner]
     least = found.lower_bound[:, None]
     lit, mean = inpaint_alike(
         texels,
         [np.where(bounded[:, None], least, values) for values in (found.median, found.mean)],
-        measured | bounded,
+        measured | bounded | glimpsed,
     )
     return LitTexture(
         lit=np.where(clipped[:, None], np.maximum(lit, least), lit),
         mean=mean,
         spread=np.nan_to_num(found.spread),
         samples=found.count.astype(np.float32),
-        coverage=CoverageMap.of(measured, clipped),
+        coverage=CoverageMap.of(measured, clipped, glimpsed),
         contradicting=contradicting,
     )

@@ -25,6 +25,7 @@ from usdbrdf.texturing.psquare import QuantileState
 from usdbrdf.texturing.samples import (
     CLIPPED,
     DARK,
+    GLIMPSE,
     MIN_COSINE,
     SAMPLE,
     Picture,
@@ -166,7 +167,8 @@ class FrameSamples(NamedTuple):
     """What one frame shows: texels with a sample (M,) int32 and their radiance (M, 3) float32;
     texels that it saw saturated, clipped (K,) int32, and the radiance that saturates it; texels
     that were too dark for it, dark (D,) int32, their radiance with the noise (D, 3) float32, and
-    the radiance of its noise floor."""
+    the radiance of its noise floor; texels that it shows together with something else, glimpsed
+    (G,) int32, and the radiance of their pixels (G, 3) float32."""
 
     frame: int
     texel: Int
@@ -176,6 +178,8 @@ class FrameSamples(NamedTuple):
     dark: Int
     darkness: Float
     noise_floor: float
+    glimpsed: Int
+    glimpse: Float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,11 +187,13 @@ class Measured:
     """What all frames say of T texels: radiance in W/(m^2 sr), NaN where no frame measured it.
 
     median       (T, 3) float32, the quantile that was asked for
-    mean         (T, 3) float32, 0 where no frame measured it
+    mean         (T, 3) float32, 0 where no frame shows it
     spread       (T, 3) float32, see ``psquare.spread``
     count        (T,) int32, samples, or where there are none, frames that show how dark it is
     clipped      (T,) int32, frames in which the texel was visible but saturated
     lower_bound  (T,) float32, the largest radiance at which it still saturated
+    glimpsed     (T,) bool: median and mean are of pixels that may show more than it; no frame
+                 measured it
     probes       (P, N) float32, some texels' samples in each frame, see ``Probes``
     """
 
@@ -197,6 +203,7 @@ class Measured:
     count: Int
     clipped: Int
     lower_bound: Float
+    glimpsed: Bool
     probes: Float
 
 
@@ -204,7 +211,8 @@ class Measured:
 class Observation:
     """What the frames so far say of the texels from number ``first`` on, updated in place.
 
-    quantiles    of the valid samples
+    quantiles    of the valid samples; where ``glimpsed`` (T,), there were none so far, of the
+                 pixels that show the texel at their centre
     clipped, lower_bound, probes  as in ``Measured``
     dark         (T,) int32, frames in which the texel was visible but too dark
     darkness     (T, 3) float32, its mean radiance in these, each weighted by the inverse of its
@@ -213,6 +221,7 @@ class Observation:
 
     first: int
     quantiles: QuantileState
+    glimpsed: Bool
     clipped: Int
     lower_bound: Float
     dark: Int
@@ -227,6 +236,7 @@ class Observation:
         return cls(
             first=part.start,
             quantiles=QuantileState.empty(count),
+            glimpsed=np.zeros(count, np.bool_),
             clipped=np.zeros(count, np.int32),
             lower_bound=np.zeros(count, np.float32),
             dark=np.zeros(count, np.int32),
@@ -237,7 +247,15 @@ class Observation:
 
     def add(self, seen: FrameSamples, quantile: float) -> None:
         """One frame more."""
-        psquare.update(self.quantiles, seen.texel - np.int32(self.first), seen.radiance, quantile)
+        sampled = seen.texel - np.int32(self.first)
+        # A sample is worth more than all glimpses before it, and after one none is asked for.
+        psquare.clear(self.quantiles, sampled[self.glimpsed[sampled]])
+        self.glimpsed[sampled] = False
+        psquare.update(self.quantiles, sampled, seen.radiance, quantile)
+        glimpsed = seen.glimpsed - np.int32(self.first)
+        new = self.glimpsed[glimpsed] | (self.quantiles.samples[glimpsed] == 0)
+        self.glimpsed[glimpsed[new]] = True
+        psquare.update(self.quantiles, glimpsed[new], seen.glimpse[new], quantile)
         saturated = seen.clipped - np.int32(self.first)
         self.clipped[saturated] += 1
         limit = np.float32(seen.saturation)
@@ -257,6 +275,7 @@ class Observation:
         return Observation(
             first=part.start,
             quantiles=QuantileState._make(values[own] for values in self.quantiles),
+            glimpsed=self.glimpsed[own],
             clipped=self.clipped[own],
             lower_bound=self.lower_bound[own],
             dark=self.dark[own],
@@ -269,6 +288,7 @@ class Observation:
         """All of its state."""
         return {
             **self.quantiles._asdict(),
+            "glimpsed": self.glimpsed,
             "clipped": self.clipped,
             "lower_bound": self.lower_bound,
             "dark": self.dark,
@@ -295,16 +315,19 @@ class Observation:
     def measured(self, quantile: float) -> dict[str, Array]:
         """The arrays of ``Measured``. What is dark in all frames is what they show, without its
         noise as far as they are many; in those that were exposed longer it is known better."""
-        dark = (self.quantiles.samples == 0) & (self.dark > 0)
+        samples = np.where(self.glimpsed, 0, self.quantiles.samples)
+        dark = (samples == 0) & (self.dark > 0)
+        spread = psquare.spread(self.quantiles, quantile)
         values = psquare.quantile(self.quantiles, quantile), self.quantiles.mean
         median, mean = (np.where(dark[:, None], self.darkness, value) for value in values)
         return {
             "median": median,
             "mean": mean,
-            "spread": psquare.spread(self.quantiles, quantile),
-            "count": np.where(dark, self.dark, self.quantiles.samples),
+            "spread": np.where(self.glimpsed[:, None], np.float32(np.nan), spread),
+            "count": np.where(dark, self.dark, samples),
             "clipped": self.clipped,
             "lower_bound": self.lower_bound,
+            "glimpsed": self.glimpsed & ~dark,
             "probes": self.probes.logarithm,
         }
 
@@ -330,8 +353,10 @@ def samples_from_frames(
         pixels = read(i)
         surfaces = first_surfaces(surface.rays, surface.scene.face_object, camera)
         picture = Picture.of(pixels)
-        kind, radiance = samples_from_frame(texels, owner, surfaces, picture, camera, which=which)
-        sampled, dark = kind == SAMPLE, kind == DARK
+        kind, radiance = samples_from_frame(
+            texels, owner, surfaces, picture, camera, which=which, glimpses=True
+        )
+        sampled, dark, glimpsed = kind == SAMPLE, kind == DARK, kind == GLIMPSE
         return FrameSamples(
             frame=i,
             texel=which[sampled],
@@ -341,6 +366,8 @@ def samples_from_frames(
             dark=which[dark],
             darkness=radiance[dark],
             noise_floor=float(frames.noise_floor_radiance[i]),
+            glimpsed=which[glimpsed],
+            glimpse=radiance[glimpsed],
         )
 
     return ahead(samples, order)
@@ -348,7 +375,7 @@ def samples_from_frames(
 
 def _nothing(frame: int) -> FrameSamples:
     none, colours = np.zeros(0, np.int32), np.zeros((0, 3), np.float32)
-    return FrameSamples(frame, none, colours, none, 1.0, none, colours, 1.0)
+    return FrameSamples(frame, none, colours, none, 1.0, none, colours, 1.0, none, colours)
 
 
 def frames_in_view(texels: Texels, part: slice, frames: Frames, own: Sequence[int]) -> list[int]:

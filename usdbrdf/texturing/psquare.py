@@ -65,6 +65,12 @@ def update(state: QuantileState, texel: Int, values: Float, p: float) -> None:
     _update(len(texel), *state, texel, values, p)
 
 
+def clear(state: QuantileState, texel: Int) -> None:
+    """Forget all samples of the listed texels, in place."""
+    state.samples[texel] = 0
+    state.mean[texel] = 0
+
+
 @parallel_kernel
 def _update(
     first: int, last: int, heights: Float, positions: Int, count: Int, mean: Float, texel: Int,

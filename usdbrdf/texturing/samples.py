@@ -5,6 +5,7 @@ pixels around its projection (3 x 3, or as many as its footprint covers) all sho
 near its own tangent plane (so it is unoccluded, and away from depth edges and the image border),
 and where every pixel of its footprint lies between noise floor and saturation in every channel.
 Beside a lamp it takes none: no lens and no filter keeps all of a lamp's light to its own pixels.
+Of what is thinner than that, a pixel whose centre shows the texel is a glimpse of it at least.
 What no frame measures because it is too dark is known to be dark: that is told as well.
 """
 
@@ -89,7 +90,7 @@ MIN_COSINE = calibration.number("samples.min_cosine")
 # Sub-samples of a texel's footprint per side, at most.
 _MAX_TAPS = 4
 _GLARE_CONTRAST = calibration.number("samples.glare_contrast")
-NOTHING, SAMPLE, CLIPPED, DARK = 0, 1, 2, 3
+NOTHING, SAMPLE, CLIPPED, DARK, GLIMPSE = 0, 1, 2, 3, 4
 
 
 class FirstSurfaces(NamedTuple):
@@ -176,14 +177,16 @@ def samples_from_frame(
     *,
     which: Int | None = None,
     beside_glare: bool = False,
+    glimpses: bool = False,
 ) -> tuple[npt.NDArray[np.int8], Float]:
     """Of the texels ``which`` (M,) int32 (None: all): NOTHING, SAMPLE, CLIPPED (visible, and
-    saturated all over its footprint) or DARK (visible, and below the noise floor in some channel
-    and pixel), (M,) int8; and the radiance (M, 3) float32 of what is SAMPLE or DARK, of the latter
-    with the noise.
+    saturated all over its footprint), DARK (visible, and below the noise floor in some channel
+    and pixel) or GLIMPSE (visible at the centre of a pixel that may show more than it), (M,) int8;
+    and the radiance (M, 3) float32 of what is SAMPLE, DARK or GLIMPSE, of DARK with the noise.
 
     texel_object  (T,) int32
     beside_glare  take samples there too, for whom highlights matter
+    glimpses      whether these are asked for
     """
     if which is None:
         which = np.arange(len(texels), dtype=np.int32)
@@ -195,7 +198,7 @@ def samples_from_frame(
         texels.position, texels.geometric_normal, texels.step_x, texels.step_y, texel_object
     )
     kind, values = np.zeros(len(which), np.int8), np.zeros((len(which), 3), np.float32)
-    _sample(len(which), which, surface, image, Projection.of(camera), kind, values)
+    _sample(len(which), which, surface, image, Projection.of(camera), glimpses, kind, values)
     return kind, values
 
 
@@ -224,15 +227,18 @@ def _sample(
     surface: _Surface,
     image: _Image,
     camera: Projection,
+    glimpses: bool,
     kind: npt.NDArray[np.int8],
     values: Float,
 ) -> None:
     for m in range(first, last):
-        kind[m] = _sample_of(which[m], surface, image, camera, values[m])
+        kind[m] = _sample_of(which[m], surface, image, camera, glimpses, values[m])
 
 
 @kernel
-def _sample_of(t: int, surface: _Surface, image: _Image, camera: Projection, value: Float) -> int:
+def _sample_of(
+    t: int, surface: _Surface, image: _Image, camera: Projection, glimpses: bool, value: Float
+) -> int:
     """What the frame shows of texel t; its radiance goes to ``value`` (3,)."""
     height, width = image.valid.shape
     p, n, eye = surface.position[t], surface.normal[t], camera.eye
@@ -255,10 +261,13 @@ def _sample_of(t: int, surface: _Surface, image: _Image, camera: Projection, val
     wide = off_x * abs(ux - u) + off_y * abs(uy - u)
     high = off_x * abs(vx - v) + off_y * abs(vy - v)
     reach = max(1, int(np.ceil(max(wide, high) + 0.5)))
-    if not shows_surface(
-        row, column, reach, p, n, surface.object[t], depth / camera.intrinsics[0], image
-    ):
-        return NOTHING
+    own, size = surface.object[t], depth / camera.intrinsics[0]
+    if not shows_surface(row, column, reach, p, n, own, size, image):
+        if not (glimpses and shows_surface(row, column, 0, p, n, own, size, image)):
+            return NOTHING
+        value[:] = image.radiance[row, column]
+        glares = image.glare[row, column] > _GLARE_CONTRAST * value.max()
+        return GLIMPSE if image.valid[row, column] and not glares else NOTHING
     taps = taps_x * taps_y
     red, green, blue = 0.0, 0.0, 0.0
     num_valid, num_clipped, num_dark = 0, 0, 0
