@@ -278,23 +278,27 @@ def estimate_clipped_light(
         chosen, segment = _chosen(surface.texels, groups, coverage.measured, seed)
         if not len(chosen):
             return {**vars(none), "wall": wall}
-        evidence = _evidence(surface, lit, groups, chosen, segment, environment, seed)
-        first = estimate_clipped_emitters(evidence)
+
+        def told_by(light: Float, groups: ClippedGroups) -> tuple[EstimatedRadiance, Bool]:
+            evidence = _evidence(surface, light, groups, chosen, segment, environment, seed)
+            first = estimate_clipped_emitters(evidence)
+            given = surface, light, coverage, frames, environment, groups, first, seed
+            return _told_by_even_light(*given)
+
+        told, evenly = told_by(lit, groups)
         if lit_unseen or environment.sun.shines or environment.image.any():
             by_hand = [said.get(int(i), False) for i in groups.object]
-            least = np.where(first.determined, first.least().max(axis=1), 1.0)
+            # Beside a window lamps as bright as need be take up what its light leaves unexplained:
+            # where other light suffices, one must show itself in the light that it casts evenly.
+            least = np.where(evenly, told.least().max(axis=1), 1.0)
             least = np.where(by_hand, np.inf, least)
             given = surface, lit, coverage, frames, groups, least, environment, seed
             wall = reflects_other_light(*given)
-        left, light = groups.with_walls(wall), lit
         if wall.any():
             # What the sun shines on may be many times its bound, which lamps beside it would send.
+            left = groups.with_walls(wall)
             light = _reflecting(surface, lit, coverage, left, wall, environment, seed, said)
-            known = left.without(wall)
-            evidence = _evidence(surface, light, known, chosen, segment, environment, seed)
-            first = estimate_clipped_emitters(evidence)
-            left = replace(left, group=known.group)
-        told = _told_by_even_light(surface, light, coverage, frames, environment, left, first, seed)
+            told, _ = told_by(light, left.without(wall))
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
@@ -397,15 +401,16 @@ def _told_by_even_light(
     groups: ClippedGroups,
     first: EstimatedRadiance,
     seed: int,
-) -> EstimatedRadiance:
+) -> tuple[EstimatedRadiance, Bool]:
     """The estimate with those of its lamps looked at closely, all together, that are determined
     or exceed their bounds; where that says too little of a lamp, or that it is darker than its
-    bound, the ``first`` one."""
+    bound, the ``first`` one. And of which (K,) it said enough."""
     told = first.determined | (first.least() > 1).any(axis=1)
     lamps = np.flatnonzero(groups.lamp & told)[:_CLOSELY]
     asked = asked_texels(surface.texels, lit, coverage, seed)
+    evenly = np.zeros(len(groups), np.bool_)
     if not len(lamps) or asked is None:
-        return first
+        return first, evenly
     plain = groups.group[asked.texel] < 0
     # An object of which a part shines mirrors a lamp there, or glows: so may the rest of it.
     without_glow = plain & ~np.isin(asked.owner, groups.object[groups.lamp])
@@ -434,8 +439,8 @@ def _told_by_even_light(
     held = multiplier / np.minimum(brightest, 1)[:, None]
     estimate.multiplier[lamps[better]] = held[better]
     estimate.standard_error[lamps[better]] = error[better, None]
-    estimate.determined[lamps[better]] = True
-    return estimate
+    estimate.determined[lamps[better]] = evenly[lamps[better]] = True
+    return estimate, evenly
 
 
 def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) -> tuple[Long, Int]:
