@@ -266,6 +266,16 @@ def test_settings_of_the_compiler_that_nothing_works_with(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.fault("S9")
+def test_settings_of_the_compiler_in_the_current_folder(capture, tmp_path, capsys, monkeypatch):
+    """Somebody works in a capture by others that brings some along: rays hit nothing."""
+    (tmp_path / ".numba_config.yaml").write_text("DISABLE_JIT: 1")
+    monkeypatch.chdir(tmp_path)
+    status, line = refused(capsys, "convert", capture, "-o", tmp_path / "out")
+    assert (status, f"{tmp_path}/.numba_config.yaml: numba" in line) == (4, True)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.fault("R17")
 def test_paths_that_nobody_can_follow(capture, tmp_path, capsys):
     (tmp_path / "loop").symlink_to("loop")
