@@ -267,6 +267,13 @@ def _refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[
         (["--exposure", "nan"], 2, "finite"),
         (["--insert", "a.ply", "scale=inf"], 2, "finite"),
         (["--insert", "a.ply", "at=1,nan,0"], 2, "finite"),
+        (["--insert", "a.ply", "at=1e308,0,0"], 2, "at most 10,000,000,000"),
+        (["--insert", "a.ply", "drop=0,-1e30"], 2, "at least -10,000,000,000"),
+        (["--insert", "a.ply", "scale=1e30"], 2, "at most 1,000,000,000"),
+        (["--exposure", "2"], 2, "--exposure: is of .png"),
+        (["--format", "png"], 2, "--format png: is of the pictures of --views"),
+        (["--views", "v.json", "--frame", "1"], 2, "--views, --frame: they exclude"),
+        (["--views", "v.json", "--camera", "/room/eye"], 2, "--views, --camera: they exclude"),
     ],
 )
 def test_refusals_are_one_sentence(
