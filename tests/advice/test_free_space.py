@@ -103,7 +103,7 @@ def test_the_clearance_that_is_told_to_be_enough_is(room, eyes, monkeypatch, mos
     def found(clearance):
         return free_places(room[2], eyes, 2, heights=(0.5, 2.0), clearance=clearance, count=5)
 
-    with pytest.raises(UsageError, match="Take .* or more") as refused:
+    with pytest.raises(UsageError, match=r"Take .* or more") as refused:
         found(0.01)
     found(float(str(refused.value).split("Take ")[1].split()[0]))
 
