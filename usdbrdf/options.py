@@ -23,9 +23,7 @@ else:
 _COUNT = (1, 2**31 - 1)
 # Metres, or metres per unit: from an atom's size to more than the Earth's.
 _LENGTH = (1e-10, 1e10)
-# Where something lies, in units: single precision holds it in any unit.
-_PLACE = (-1e10, 1e10)
-
+_PLACE = (-1e10, 1e10)  # in units
 
 # What may stand in the place of a picture of the surroundings.
 ESTIMATE: Literal["estimate"] = "estimate"
