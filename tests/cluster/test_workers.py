@@ -430,6 +430,16 @@ def test_workers_that_do_not_end_in_time_are_killed_and_hide_no_other_end(
     close(cluster)
 
 
+@pytest.mark.parametrize("place", [Path("shared"), "s3://scans/shared"])
+def test_a_place_that_nobody_shares_is_refused(place: Path | str) -> None:
+    """This process did all by itself, without a word."""
+    with (
+        pytest.raises(UsageError, match=r"--shared-folder .*nobody.*--workers.*\[usage.option\]"),
+        workers_of(ClusterOptions(shared_folder=place)),
+    ):
+        pass
+
+
 def test_workers_of_two_kinds_exclude_each_other() -> None:
     with pytest.raises(UsageError, match="exclude each other"):
         ClusterOptions(workers=2, scheduler="tcp://127.0.0.1:8786")

@@ -59,6 +59,11 @@ def workers_of(options: ClusterOptions | None = None, client: Any = None) -> Ite
     for what cannot be shared."""
     chosen = options or ClusterOptions()
     if client is None and not chosen.asked:
+        if chosen.shared_folder is not None:
+            raise UsageError(
+                f"--shared-folder {chosen.shared_folder}: nobody to share it with. Ask for "
+                "--workers or a --scheduler too, or leave it out. [usage.option]"
+            )
         yield HERE
         return
     _need_dask()
