@@ -266,6 +266,35 @@ def test_settings_of_the_compiler_that_nothing_works_with(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("area", ["-1", "-inf", "nan"])
+def test_an_area_is_no_less_than_nothing(capture, tmp_path, capsys, area):
+    named = ["ingest", capture, "-o", tmp_path / "out", f"--min-component-area={area}"]
+    status, line = refused(capsys, *named)
+    assert (status, "--min-component-area" in line, "at least 0" in line) == (2, True, True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_where_memory_runs_out_what_asks_for_less_is_named(capsys, monkeypatch):
+    """Of a picture 65,536 pixels wide a larger --texel-size saves nothing."""
+
+    def ends(_):
+        raise MemoryError
+
+    monkeypatch.setattr("usdbrdf.cli._run", ends)
+    status, line = refused(capsys, "relight", "a", "-o", "b.exr")
+    assert (status, "--width" in line, "--texel-size" in line) == (4, True, True)
+
+
+@pytest.mark.fault("S9")
+def test_settings_of_the_compiler_in_the_current_folder(capture, tmp_path, capsys, monkeypatch):
+    """Somebody works in a capture by others that brings some along: rays hit nothing."""
+    (tmp_path / ".numba_config.yaml").write_text("DISABLE_JIT: 1")
+    monkeypatch.chdir(tmp_path)
+    status, line = refused(capsys, "convert", capture, "-o", tmp_path / "out")
+    assert (status, f"{tmp_path}/.numba_config.yaml: numba" in line) == (4, True)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.fault("R17")
 def test_paths_that_nobody_can_follow(capture, tmp_path, capsys):
     (tmp_path / "loop").symlink_to("loop")

@@ -31,7 +31,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UsdBrdfError as error:
         return _refuse(str(error), error.exit_code)
     except MemoryError:
-        return _refuse("out of memory. Choose a larger --texel-size. [environment.memory]", 4)
+        return _refuse(
+            "out of memory. Free some, or ask for less: a larger --texel-size, or a smaller "
+            "--width of pictures. [environment.memory]",
+            4,
+        )
     except KeyboardInterrupt:
         return _refuse("interrupted; the same command goes on from here.", 130)
     except Terminated:

@@ -96,7 +96,7 @@ class FarmWork(OnCapture, Locking, _InBundle):
 
     def run(self) -> int:
         with loading():
-            from usdbrdf.farm.scans import numbers_in
+            from usdbrdf.farm.scans import numbers_in, refuse_results_inside
             from usdbrdf.farm.work import Work, openjd_lines, work_on
         scans, results = self.list_and_results()
         count = len(scans.names)
@@ -116,6 +116,7 @@ class FarmWork(OnCapture, Locking, _InBundle):
         )  # fmt: skip
         root = scans.root if self.root is None else self.root.absolute()
         chosen = [(scans.names[n - 1], root / scans.places[n - 1]) for n in numbers]
+        refuse_results_inside(results.folder, [place for _, place in chosen])
         try:
             records, status = work_on(chosen, work, told)
         finally:
@@ -130,9 +131,11 @@ class FarmTable(_InBundle):
     def run(self) -> int:
         with loading():
             from usdbrdf.farm.page import page_of
+            from usdbrdf.farm.scans import refuse_results_inside
             from usdbrdf.farm.table import counted, exit_code, rows_of, summary, table_lines
             from usdbrdf.files.atomic import environment_failures, write_text_atomic
         scans, results = self.list_and_results()
+        refuse_results_inside(results.folder, [scans.root / place for place in scans.places])
         rows = rows_of(scans, results)
         with environment_failures(str(results.table)):
             results.folder.mkdir(parents=True, exist_ok=True)

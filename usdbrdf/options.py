@@ -23,7 +23,7 @@ else:
 _COUNT = (1, 2**31 - 1)
 # Metres, or metres per unit: from an atom's size to more than the Earth's.
 _LENGTH = (1e-10, 1e10)
-
+_PLACE = (-1e10, 1e10)  # in units
 
 # What may stand in the place of a picture of the surroundings.
 ESTIMATE: Literal["estimate"] = "estimate"
@@ -127,7 +127,7 @@ class CaptureOptions(Options):
     decimate: int | None = option("--decimate N", None, _COUNT, unset="keep all")
     "reduce the mesh to about N triangles"
     min_component_area_m2: float | None = option(
-        "--min-component-area M2", None, unset="0.0001 of the mesh's area"
+        "--min-component-area M2", None, (0, math.inf), unset="0.0001 of the mesh's area"
     )
     "without labels, connected parts of at least this many m^2 become objects"
     assume_srgb: bool = option("--assume-srgb", False)
@@ -335,13 +335,13 @@ class Insert(Options):
     """
 
     model: Path
-    at: tuple[float, ...] | None = option("at X,Y,Z", None, counts=(3,))
+    at: tuple[float, ...] | None = option("at X,Y,Z", None, _PLACE, counts=(3,))
     "where the model's origin comes to lie"
-    drop: tuple[float, ...] | None = option("drop X,Y[,Z]", None, counts=(2, 3))
+    drop: tuple[float, ...] | None = option("drop X,Y[,Z]", None, _PLACE, counts=(2, 3))
     "let it fall there (from the height Z; default: from that of the highest capture camera)"
     matrix: Double | None = option("matrix FILE", None)
     "with 4 x 4 numbers, world from model, instead of the others"
-    scale: float = option("scale S", 1.0, (1e-9, math.inf))
+    scale: float = option("scale S", 1.0, (1e-9, 1e9))
     "factor on the model's size"
     rotate_deg: float = option("rotate DEG", 0.0)
     "about the up axis, counter-clockwise seen from above"

@@ -8,6 +8,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from tests.advice.plate_room import CABINET, ROOM, frame_poses, mesh
+from usdbrdf.advice import free_space
 from usdbrdf.advice.free_space import corners_near, free_places, is_enclosed, surface_samples
 from usdbrdf.errors import UsageError
 from usdbrdf.transport.rays import RayScene
@@ -91,6 +92,20 @@ def test_nobody_is_sent_onto_a_bed():
 def test_where_there_is_no_room_there_is_no_place(room, eyes):
     found = free_places(room[2], eyes, 2, heights=(0.5, 2.0), clearance=2.0, count=50)
     assert len(found.eye) == 0
+
+
+@pytest.mark.parametrize("most", [500, 1000, 3000, 7000, 20_000])
+def test_the_clearance_that_is_told_to_be_enough_is(room, eyes, monkeypatch, most):
+    """Rounded down it was refused with itself: "--clearance 0.01: ... Take 0.01 or more"."""
+    monkeypatch.setattr(free_space, "_NODES", most)
+    monkeypatch.setattr(free_space, "_MOST_NODES", most)
+
+    def found(clearance):
+        return free_places(room[2], eyes, 2, heights=(0.5, 2.0), clearance=clearance, count=5)
+
+    with pytest.raises(UsageError, match=r"Take .* or more") as refused:
+        found(0.01)
+    found(float(str(refused.value).split("Take ")[1].split()[0]))
 
 
 def test_samples_lie_as_close_as_is_asked(room):

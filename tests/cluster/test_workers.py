@@ -25,6 +25,7 @@ import usdbrdf.texturing.passes
 from tests.scenes import make_capture
 from usdbrdf import pipeline
 from usdbrdf.asset.layout import Asset
+from usdbrdf.cluster import session
 from usdbrdf.cluster.options import ClusterOptions
 from usdbrdf.cluster.session import _Session, workers_of
 from usdbrdf.errors import EnvironmentFailure, UsageError
@@ -319,8 +320,6 @@ def test_a_worker_whose_disk_is_full_is_a_sentence_and_another_goes_on_from_ther
 def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     import distributed
 
-    from usdbrdf.cluster import session
-
     tries = []
 
     def dies(**_: object) -> None:
@@ -334,6 +333,47 @@ def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
     ):
         pass
     assert len(tries) == 3
+
+
+STARTED_IN_A_CAPTURE = """
+import os
+from usdbrdf.cluster.session import _local_cluster
+if __name__ == "__main__":
+    with _local_cluster(1) as cluster:
+        print(len(cluster.workers))
+    print("PYTHONSAFEPATH" in os.environ)
+"""
+
+
+@pytest.mark.fault("S9")
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="it is refused there")
+def test_workers_run_no_module_that_lies_in_the_current_folder(tmp_path: Path) -> None:
+    """A capture by others in which somebody works may hold one that Python looks for first."""
+    program, capture = tmp_path / "program" / "start.py", tmp_path / "capture"
+    program.parent.mkdir()
+    capture.mkdir()
+    program.write_text(STARTED_IN_A_CAPTURE)
+    for name in ("pickle", "socket", "distributed", "usdbrdf"):
+        (capture / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write('{name}')")
+    found = subprocess.run(
+        [sys.executable, str(program)],
+        cwd=capture,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
+        capture_output=True,
+        text=True,
+    )
+    assert not (tmp_path / "ran").exists()
+    assert found.stdout.split() == ["1", "False"]
+
+
+def test_where_python_runs_modules_of_the_current_folder_they_are_refused(tmp_path: Path) -> None:
+    for innocent in ("pickled.py", "select.exr", "usdbrdf.py"):
+        (tmp_path / innocent).touch()
+    (tmp_path / "json").mkdir()
+    session.refuse_modules_of(tmp_path)
+    (tmp_path / "json" / "__init__.py").touch()
+    with pytest.raises(EnvironmentFailure, match=r"/json: .*another folder.*\[cluster.modules\]"):
+        session.refuse_modules_of(tmp_path)
 
 
 def test_workers_leave_nothing_among_temporary_files(
@@ -388,6 +428,16 @@ def test_workers_that_do_not_end_in_time_are_killed_and_hide_no_other_end(
     with suppress(psutil.NoSuchProcess):
         psutil.Process(pid).wait(10)
     close(cluster)
+
+
+@pytest.mark.parametrize("place", [Path("shared"), "s3://scans/shared"])
+def test_a_place_that_nobody_shares_is_refused(place: Path | str) -> None:
+    """This process did all by itself, without a word."""
+    with (
+        pytest.raises(UsageError, match=r"--shared-folder .*nobody.*--workers.*\[usage.option\]"),
+        workers_of(ClusterOptions(shared_folder=place)),
+    ):
+        pass
 
 
 def test_workers_of_two_kinds_exclude_each_other() -> None:

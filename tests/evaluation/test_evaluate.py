@@ -5,6 +5,9 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -148,6 +151,44 @@ def test_without_matplotlib_one_line_says_so(monkeypatch, tmp_path, capsys):
     write_plot(tmp_path / "evaluation.png", [])
     assert "usdbrdf[report]" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+DRAWN = """
+import sys
+from pathlib import Path
+from usdbrdf.evaluation.report import write_plot
+class Row(dict):
+    def __missing__(self, key):
+        return 0.5
+write_plot(Path(sys.argv[1]), [Row(), Row()])
+"""
+
+
+@pytest.mark.fault("S9")
+def test_settings_of_matplotlib_in_the_current_folder_play_no_part(tmp_path):
+    """A capture by others may bring some along, in which somebody works: they ran LaTeX, or ended
+    what had rendered all views."""
+    pytest.importorskip("matplotlib", reason="the plot is the extra `report`")
+    (program := tmp_path / "draw.py").write_text(DRAWN)
+    said = {}
+    for name, settings in (
+        ("none", None),
+        ("latex", b"text.usetex: True\nfigure.dpi: 7\naxes.facecolor: black\n"),
+        ("no text", b"\xff\xfe"),
+    ):
+        (place := tmp_path / name).mkdir()
+        if settings is not None:
+            (place / "matplotlibrc").write_bytes(settings)
+        said[name] = subprocess.run(
+            [sys.executable, program, place / "plot.svg"],
+            cwd=place,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
+            capture_output=True, text=True, check=True,
+        ).stderr  # fmt: skip
+    plots = {name: tmp_path / name / "plot.svg" for name in said}
+    assert plots["latex"].read_bytes() == plots["none"].read_bytes()
+    assert not plots["no text"].exists()
+    assert "not drawn, matplotlib cannot read its settings" in said["no text"]
 
 
 def test_with_it_there_is_a_plot(found):

@@ -338,6 +338,26 @@ def test_scans_and_results_lie_apart(tmp_path, capsys, scan, bundle):
     assert not [*tmp_path.rglob("scans.json")]
 
 
+@pytest.mark.parametrize("command", ["farm-work", "farm-table"])
+@pytest.mark.parametrize("results", ["there/scan", "there/scan/results", "link"])
+def test_results_of_another_place_lie_apart_too(tmp_path, capsys, command, results):
+    """They were written into the scan that they are of, which the next task then found changed."""
+    place = folders(tmp_path, "there/scan")[0]
+    (tmp_path / "link").symlink_to(place)
+    bundle = str(tmp_path / "bundle")
+    assert main(["farm", str(place), "-o", bundle, "-q"]) == 0
+    if command == "farm-work":  # where the scans were brought to counts, not where they were
+        (tmp_path / "there").rename(tmp_path / "moved")
+        place = tmp_path / "moved/scan"
+        (tmp_path / "link").unlink()
+        (tmp_path / "link").symlink_to(place)
+        results = results.replace("there", "moved")
+    root = ["--root", str(place.parent)] if command == "farm-work" else []
+    assert main([command, bundle, *root, "--results", str(tmp_path / results)]) == 2
+    assert "[farm.inside]" in capsys.readouterr().err
+    assert not [*place.iterdir()]
+
+
 def test_a_folder_of_somebody_else_stays(tmp_path):
     scans = list_of(folders(tmp_path, "a"))
     (tmp_path / "theirs").mkdir()

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -214,6 +215,30 @@ def test_a_file_that_does_not_read_back_is_not_published(tmp_path, monkeypatch, 
         write_exr(path, radiance + 1)
     assert path.read_bytes() == before
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.fault("R1")
+@pytest.mark.parametrize("suffix", [".jpg", ".JPEG"])
+def test_a_picture_for_people_may_be_a_jpeg_that_is_written_whole(tmp_path, monkeypatch, suffix):
+    """Its pixels are others than those that were written, and were taken for a disk's failure."""
+    path = tmp_path / f"a{suffix}"
+    rgb8 = np.random.default_rng(0).integers(0, 256, (24, 32, 1), np.uint8).repeat(3, axis=2)
+    write_preview_png(path, rgb8)
+    assert np.abs(read_radiance(path) * 255 - rgb8).mean() < 3
+    before, write = path.read_bytes(), images.write_image
+
+    def losing(path, staged, spec, pixels, lost):
+        write(path, staged, spec, pixels)
+        if staged.parent == tmp_path or lost == "end":
+            content = staged.read_bytes()
+            staged.write_bytes(content[:-9] if lost == "end" else content[:400] + content[500:])
+
+    for lost in ("middle", "end"):
+        monkeypatch.setattr(images, "write_image", partial(losing, lost=lost))
+        with pytest.raises(EnvironmentFailure, match=r"does not read back.+\[image\.write\]$"):
+            write_preview_png(path, rgb8)
+    assert path.read_bytes() == before
+    assert [*tmp_path.iterdir()] == [path]
 
 
 def test_preview(tmp_path, radiance):

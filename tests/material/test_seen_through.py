@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import Part, World, quad, room, world_of
-from usdbrdf.material.seen_through import Through, radiance_behind, seen_through
+from usdbrdf.material.seen_through import (
+    NOTHING,
+    Through,
+    _least_squares,
+    radiance_behind,
+    seen_through,
+)
 from usdbrdf.material.verdict import MOST_OF_MEASURED, LobeEstimate
 from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.transport.environment import Environment
@@ -135,3 +141,46 @@ def test_behind_what_looks_alike_from_everywhere_nothing_tells(lit: LitScene):
     none = np.zeros((len(texel), 3, 1), np.float32)
     found = seen_through(samples, behind, lambda _: (none, none), LOBE)
     assert found.at_least == 0
+
+
+class Plain:
+    """A model of samples that err alike: products are sums."""
+
+    def reduced(self, values):
+        self.values = values
+        return self
+
+    def parts(self, count):
+        assert count == self.values.shape[2]
+        return tuple(np.moveaxis(self.values, 2, 0))
+
+    def product(self, one, other):
+        return np.array([(one * other).sum()])
+
+
+@pytest.mark.parametrize(
+    ("psi", "share"), [(0.3, 0.4), (0.7, 0.1), (0.2, 1.4), (0.6, -0.5), (1.3, 0.5), (-0.4, 0.8)]
+)
+def test_both_factors_are_those_of_least_squares_between_0_and_1(psi, share):
+    random = np.random.default_rng(3)
+    lobe, behind = random.uniform(0, 1, (2, 40, 3))
+    behind += lobe  # so that neither is told without the other
+    rest = psi * lobe + share * behind + 0.01 * random.standard_normal((40, 3))
+    columns = np.stack([lobe.ravel(), behind.ravel()], axis=1)
+    free = np.linalg.lstsq(columns, rest.ravel(), rcond=None)[0]
+    found, through = _least_squares(Plain(), rest, lobe, behind)
+    assert through.share == pytest.approx(np.clip(free[1], 0, 1))
+    assert through.error == pytest.approx(np.sqrt(np.linalg.inv(columns.T @ columns)[1, 1]))
+    # Once one is held the other is what is best beside it.
+    left = rest - through.share * behind
+    assert found == pytest.approx(np.clip((left * lobe).sum() / (lobe**2).sum(), 0, 1))
+
+
+def test_what_looks_as_the_lobe_does_or_is_not_there_tells_nothing():
+    random = np.random.default_rng(3)
+    lobe, none = random.uniform(0, 1, (40, 3)), np.zeros((40, 3))
+    for behind in (2 * lobe, none):
+        assert _least_squares(Plain(), 0.3 * lobe, lobe, behind) == (pytest.approx(0.3), NOTHING)
+    psi, through = _least_squares(Plain(), 0.3 * lobe, none, lobe)
+    assert (psi, through.share) == (0.0, pytest.approx(0.3))
+    assert through.error == pytest.approx(1 / np.sqrt((lobe**2).sum()))

@@ -69,6 +69,8 @@ def test_verdicts_are_written_for_the_page_alone(server, built):
     assert asked(server, "POST", "/review", body, **kind)[0] == 404
     assert asked(server, "POST", path, "{", **kind)[0] == 400
     assert asked(server, "POST", path, '{"/x": {}}', **kind)[0] == 400
+    longer_than_any_float = f'{{"{CHAIR}": {{"verdict": "accept", "phi": 1{"0" * 400}}}}}'
+    assert asked(server, "POST", path, longer_than_any_float, **kind)[0] == 400
     assert not review_file(built.asset).exists()
     assert asked(server, "POST", path, body, Origin=own, **kind) == (200, b"saved")
     assert read_review(built.asset)[CHAIR].comment == "fine"

@@ -10,7 +10,14 @@ from tests.physics.chi2 import sidak
 from tests.physics.surfaces import World, box, estimates, room, world_of
 from usdbrdf.options import Sampling
 from usdbrdf.transport.environment import Environment, black_environment
-from usdbrdf.transport.irradiance import ByAngle, Irradiance, irradiance_at, tiles_of_texels
+from usdbrdf.transport.irradiance import (
+    ByAngle,
+    Irradiance,
+    _noisy,
+    irradiance_at,
+    mean_and_error,
+    tiles_of_texels,
+)
 from usdbrdf.transport.lights import Lights
 
 # Quads of the room and its two boxes; those of the lamp follow.
@@ -242,3 +249,32 @@ def test_light_that_counts_by_its_angle_comes_to_the_same_by_either_technique(fu
     assert (mis < 0.95 * whole).all()
     alike = ByAngle(np.ones((1, 2), np.float32), surface)
     np.testing.assert_allclose(found("mis", 1 << 13, alike), whole, rtol=1e-5)
+
+
+def _told_to_go_on(error: float, *, dark: float = 0.0) -> np.ndarray:
+    """Of three tiles, of which the second errs so, asked for 10 %."""
+    tile = np.array([4, 4, 5, 5, 5, 7])
+    mean = np.array([[1, 2, 3], [3, 4, 5], [2, 2, 2], [0, 1, 2], [3, 4, 5], [0, 0, 0]], float)
+    errors = np.full((6, 3), 1e-3)
+    # Squares add up over three points and channels: their mean is that of the tile.
+    errors[2:5] = 0
+    errors[3] = error * np.sqrt(3) * np.array([1, 1, 1])
+    return _noisy(tile, mean, errors, 0.1, np.full(6, dark))
+
+
+def test_a_tile_goes_on_while_its_error_is_more_than_asked_for_of_its_mean():
+    # The second's mean is (2 + 1 + 4) / 3; the third is dark, so that any error is too much.
+    level = 7 / 3
+    assert _told_to_go_on(0.1 * level * 1.001).tolist() == [False] * 2 + [True] * 4
+    assert _told_to_go_on(0.1 * level * 0.999).tolist() == [False] * 5 + [True]
+    # Where less than that is dark, the error counts against that.
+    assert _told_to_go_on(0.5 * 0.999, dark=5.0).tolist() == [False] * 6
+    assert _told_to_go_on(0.5 * 1.001, dark=5.0).tolist() == [False] * 2 + [True] * 3 + [False]
+
+
+def test_mean_and_error_are_those_of_four_blocks_of_both_techniques():
+    sums = np.random.default_rng(5).uniform(0, 9, (2, 4, 7, 4))
+    mean, error = mean_and_error(sums, 32)
+    blocks = sums.sum(axis=0)[..., :3] / 8
+    np.testing.assert_allclose(mean, blocks.mean(axis=0))
+    np.testing.assert_allclose(error, blocks.std(axis=0, ddof=1) / 2)

@@ -177,6 +177,15 @@ def test_png_is_exposed_and_says_how_far(
     assert np.median(shown) == pytest.approx(1.055 * 0.8 ** (1 / 2.4) - 0.055, abs=0.02)
 
 
+def test_a_picture_may_be_a_jpeg(room: Path, tmp_path: Path) -> None:
+    target = tmp_path / "picture.jpg"
+    options = ["--camera", "/room/eye", "--width", "8", "--samples", "62"]
+    assert main(["relight", str(room), "-o", str(target), *options]) == 0
+    # Linear 0.8 of the mean, as above.
+    shown = np.median(read_radiance(target))
+    assert shown == pytest.approx(1.055 * 0.8 ** (1 / 2.4) - 0.055, abs=0.03)
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_both_variants_render_a_folder_of_views(
     room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str
@@ -258,6 +267,13 @@ def _refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[
         (["--exposure", "nan"], 2, "finite"),
         (["--insert", "a.ply", "scale=inf"], 2, "finite"),
         (["--insert", "a.ply", "at=1,nan,0"], 2, "finite"),
+        (["--insert", "a.ply", "at=1e308,0,0"], 2, "at most 10,000,000,000"),
+        (["--insert", "a.ply", "drop=0,-1e30"], 2, "at least -10,000,000,000"),
+        (["--insert", "a.ply", "scale=1e30"], 2, "at most 1,000,000,000"),
+        (["--exposure", "2"], 2, "--exposure: is of .png"),
+        (["--format", "png"], 2, "--format png: is of the pictures of --views"),
+        (["--views", "v.json", "--frame", "1"], 2, "--views, --frame: they exclude"),
+        (["--views", "v.json", "--camera", "/room/eye"], 2, "--views, --camera: they exclude"),
     ],
 )
 def test_refusals_are_one_sentence(

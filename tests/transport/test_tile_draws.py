@@ -3,6 +3,8 @@ each cell of a round; groups that share directions."""
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -74,6 +76,27 @@ def test_a_round_has_one_sample_in_each_cell_for_every_point(samples: int):
         np.testing.assert_array_equal(
             np.sort(cell, axis=0), np.repeat(np.arange(samples)[:, None], cell.shape[1], axis=1)
         )
+
+
+@pytest.mark.parametrize(
+    ("first", "shared"), [(1, (0, 0)), (2, (1, 0)), (24, (2, 1)), (32, (3, 2)), (48, (2, 2))]
+)
+def test_the_scene_s_bits_divide_the_first_round(first: int, shared: tuple[int, int]):
+    assert tile_draws(3, first, 64).shared == shared
+
+
+@pytest.mark.parametrize(("samples", "points"), [(1, 2), (2, 2), (3, 4), (64, 64), (65, 128)])
+def test_there_are_points_for_all_samples(samples: int, points: int):
+    assert tile_draws(3, 1, samples).sobol.shape == (points, 4)
+
+
+def test_the_scene_s_random_bits_are_all_of_a_number_s_and_different_in_each_dimension():
+    # Chi-square over each of the 32 bits of 400 seeds; the first of Sobol's points is 0.
+    flips = np.array([tile_draws(seed, 1, 2).sobol[0] for seed in range(400)])
+    ones = (flips[..., None] >> np.arange(32, dtype=np.uint32) & 1).astype(int).sum(axis=0)
+    assert (np.abs(ones - 200) < 5 * 10).all()
+    for one, other in itertools.combinations(range(4), 2):
+        assert abs(np.corrcoef(flips[:, one], flips[:, other])[0, 1]) < 5 / np.sqrt(400)
 
 
 def test_a_group_shares_its_directions_and_no_two_groups_do():

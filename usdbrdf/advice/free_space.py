@@ -3,6 +3,7 @@ clearance; in a room at a person's height, around an object as far away as the c
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -67,10 +68,10 @@ def free_places(
     volume = float(np.prod(np.maximum(high - low, clearance)))
     step = float(np.clip(np.cbrt(volume / _NODES), 0.8 * clearance, 1.9 * clearance))
     if volume / step**3 > _MOST_NODES:
-        least = float(np.cbrt(volume / _MOST_NODES)) / 1.9
+        least = _rounded_up(float(np.cbrt(volume / _MOST_NODES)) / 1.9)
         raise UsageError(
             f"--clearance {clearance:g}: too many places lie so close to each other in "
-            f"{volume:,.0f} m^3. Take {least:.2g} or more. [usage.option]"
+            f"{volume:,.0f} m^3. Take {least:g} or more. [usage.option]"
         )
     corners = corners_near(
         rays.points[rays.triangles].astype(np.float64), low - 2 * clearance, high + 2 * clearance
@@ -138,6 +139,12 @@ def surface_samples(corners: Double, spacing: float) -> Double:
     cell = np.floor(every / (spacing / 4)).astype(np.int64)
     kept: Double = every[np.unique(cell, axis=0, return_index=True)[1]]
     return kept
+
+
+def _rounded_up(number: float) -> float:
+    """To two digits: what is told to be enough is."""
+    unit = 10.0 ** (math.floor(math.log10(number)) - 1)
+    return math.ceil(number / unit) * unit
 
 
 def is_enclosed(rays: RayScene, eyes: Double) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 import unicodedata
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -145,7 +146,7 @@ def _judgement(said: Any, subject: str) -> Judgement:
     for item in fields(Judgement):
         value = said.get(item.name) if isinstance(said, Mapping) else None
         number = isinstance(item.default, float)
-        fitting = isinstance(value, int | float) if number else isinstance(value, str)
+        fitting = _is_number(value) if number else isinstance(value, str)
         if not isinstance(said, Mapping) or (value is not None and not fitting):
             raise InputRefused(
                 f"{subject}: its review holds something else than a verdict, a comment and a "
@@ -154,6 +155,11 @@ def _judgement(said: Any, subject: str) -> Judgement:
         if value is not None:
             known[item.name] = float(value) if number else value
     return Judgement(**known)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is one that a float can be; JSON has whole numbers of any length."""
+    return isinstance(value, float) or (isinstance(value, int) and abs(value) <= sys.float_info.max)
 
 
 def judgements_of(asset: Asset, said: Any) -> dict[str, Judgement]:

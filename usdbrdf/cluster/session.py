@@ -7,6 +7,7 @@ import errno
 import logging
 import os
 import signal
+import sys
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
@@ -44,6 +45,8 @@ _UNWATCHED = {
 # In which a worker that died is to be back before it is given up: a busy machine takes long to
 # start one, and who begins anew all the time never ends.
 _PATIENT = {"distributed.deploy.lost-worker-timeout": "60s"}
+# What tells Python since 3.11 to look for modules where it is told to alone.
+_SAFE_PATH = "PYTHONSAFEPATH"
 # Of a terminal's Ctrl-C, which all its processes get, this one tells and ends the others.
 _DEAF = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 
@@ -56,6 +59,11 @@ def workers_of(options: ClusterOptions | None = None, client: Any = None) -> Ite
     for what cannot be shared."""
     chosen = options or ClusterOptions()
     if client is None and not chosen.asked:
+        if chosen.shared_folder is not None:
+            raise UsageError(
+                f"--shared-folder {chosen.shared_folder}: nobody to share it with. Ask for "
+                "--workers or a --scheduler too, or leave it out. [usage.option]"
+            )
         yield HERE
         return
     _need_dask()
@@ -182,6 +190,7 @@ def _local_cluster(count: int) -> Iterator[Any]:
 
     given = {"NUMBA_NUM_THREADS": threads}
     with ExitStack() as stack:
+        stack.enter_context(_no_modules_of_the_current_folder())
         stack.enter_context(config.set(_PATIENT))
         if not config.get("temporary-directory", None):
             # Dask would leave its locks behind, and what workers had that were killed last.
@@ -193,6 +202,39 @@ def _local_cluster(count: int) -> Iterator[Any]:
             yield cluster
         finally:
             _end(cluster)
+
+
+@contextmanager
+def _no_modules_of_the_current_folder() -> Iterator[None]:
+    """Interpreters that are started in here run nothing that lies in the current folder, which may
+    be a stranger's capture: Dask starts its own with "-c", which looks for modules there first."""
+    if sys.version_info < (3, 11):
+        refuse_modules_of(Path.cwd())
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(_SAFE_PATH, None)
+        else:
+            os.environ[_SAFE_PATH] = before
+
+
+def refuse_modules_of(folder: Path) -> None:
+    """EnvironmentFailure where Python would take a file or folder for a module of its own."""
+    found = sorted(
+        entry.name
+        for entry in folder.iterdir()
+        if entry.name.partition(".")[0] in sys.stdlib_module_names
+        and (entry.suffix in (".py", ".pyc", ".so") or any(entry.glob("__init__.*")))
+    )
+    if found:
+        raise EnvironmentFailure(
+            f"{folder / found[0]}: Python would run this in the place of its own module when "
+            "workers start here. Run the same command in another folder, or with Python 3.11 or "
+            "later. [cluster.modules]"
+        )
 
 
 def _end(cluster: Any) -> None:

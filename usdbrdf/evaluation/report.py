@@ -177,17 +177,36 @@ def write_document(work: Path, document: str, found: dict[str, Any]) -> None:
 def write_plot(path: Path, rows: Sequence[Row]) -> None:
     """Panels of L2 and FLIP over the rows ``l2_baseline``, ``l2_full``, ... as PNG or SVG.
 
-    Without matplotlib nothing is drawn, and one line says so.
+    Without matplotlib nothing is drawn, and one line says so. Its settings, of which it takes those
+    in the current folder for the user's, play no part.
     """
     try:
-        from matplotlib import rc_context
+        from matplotlib import rc_context, rcdefaults
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
         say(f"{path.name}: not drawn, matplotlib is missing. Install usdbrdf[report].")
         return
-    figure = Figure(figsize=(15, 4), layout="constrained")
-    FigureCanvasAgg(figure)
+    except ValueError as error:
+        say(f"{path.name}: not drawn, matplotlib cannot read its settings, matplotlibrc ({error}).")
+        return
+    with rc_context():
+        rcdefaults()
+        figure = Figure(figsize=(15, 4), layout="constrained")
+        FigureCanvasAgg(figure)
+        _draw_panels(figure, rows)
+        # Equal rows give equal bytes.
+        metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
+        with (
+            environment_failures(str(path)),
+            temporary_beside(path) as staged,
+            rc_context({"svg.hashsalt": "usdbrdf"}),
+        ):
+            figure.savefig(staged, dpi=110, format=path.suffix[1:], metadata=metadata)
+            publish(staged, path)
+
+
+def _draw_panels(figure: Any, rows: Sequence[Row]) -> None:
     for axes, (metric, title) in zip(figure.subplots(1, len(_PANELS)), _PANELS, strict=True):
         for key, label, colour in _LINES:
             values = np.array([row[f"{metric}_{key}"] for row in rows], float)
@@ -199,15 +218,6 @@ def write_plot(path: Path, rows: Sequence[Row]) -> None:
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
     axes.legend()
-    # Equal rows give equal bytes.
-    metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
-    with (
-        environment_failures(str(path)),
-        temporary_beside(path) as staged,
-        rc_context({"svg.hashsalt": "usdbrdf"}),
-    ):
-        figure.savefig(staged, dpi=110, format=path.suffix[1:], metadata=metadata)
-        publish(staged, path)
 
 
 @contextmanager

@@ -184,6 +184,18 @@ def refuse_nested(folder: Path, scans: ScanList) -> None:
             )
 
 
+def refuse_results_inside(folder: Path, places: Iterable[Path]) -> None:
+    """UsageError for results inside a scan, which each of them would change; links are followed."""
+    results = folder.resolve()
+    for place in places:
+        scan = place.resolve()
+        if results.is_relative_to(scan) and scan.is_dir():
+            raise UsageError(
+                f"--results {folder}: lies inside the scan {place}. Choose a folder beside the "
+                "scans. [farm.inside]"
+            )
+
+
 def numbers_in(text: str, count: int) -> list[int]:
     """The numbers that a range of OpenJD means ("7", "1-5", "1-9:2,12"), of 1 to ``count``, sorted;
     UsageError for what is no such range."""

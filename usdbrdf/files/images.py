@@ -28,6 +28,7 @@ from usdbrdf.files.atomic import (
 )
 from usdbrdf.files.camera_colour import space_by_exif
 from usdbrdf.files.channels import colours_of, layers_with_colours
+from usdbrdf.files.jpeg_bytes import END, JPEG_SUFFIXES, jpeg_without_metadata, segments_of_jpeg
 from usdbrdf.files.paths import readable_size
 from usdbrdf.files.radiance_header import primaries_of_hdr
 from usdbrdf.files.scratch import scratch_folder
@@ -272,13 +273,17 @@ def resized(pixels: Float, width: int, height: int) -> Float:
 
 
 def write_preview_png(path: Path, rgb8: Byte) -> None:
-    """Write an 8-bit sRGB picture, (H, W, 3) uint8, for people to look at."""
+    """Write an 8-bit sRGB picture, (H, W, 3) uint8, for people to look at; as JPEG where ``path``
+    ends so."""
     spec = _spec_of_preview(path, rgb8)
     spec.attribute("DateTime", _PINNED_DATE)
     spec.set_colorspace("srgb_rec709_scene")
     with temporary_beside(path) as staged:
         write_image(path, staged, spec, np.ascontiguousarray(rgb8))
-        refuse_other(path, staged, rgb8)
+        if path.suffix.lower() in JPEG_SUFFIXES:
+            _refuse_other_jpeg(path, staged, spec, rgb8)
+        else:
+            refuse_other(path, staged, rgb8)
         publish(staged, path)
 
 
@@ -293,30 +298,6 @@ def encoded_jpeg(rgb8: Byte, quality: int) -> bytes:
         spec.attribute("Compression", f"jpeg:{quality}")
         write_image(path, path, spec, np.ascontiguousarray(rgb8))
         return jpeg_without_metadata(path.read_bytes())
-
-
-def jpeg_without_metadata(content: bytes) -> bytes:
-    """A JPEG without applications' segments, EXIF and XMP among them, without comments and without
-    what follows its end; what says how its numbers are colours stays."""
-    kept, position = content[:2], 2
-    for kind, end in _segments_of_jpeg(content):
-        part = content[position:end]
-        profile = kind == 0xE2 and part[4:16] == b"ICC_PROFILE\0"
-        adobe = kind == 0xEE and part[4:9] == b"Adobe"
-        if profile or adobe or not (0xE1 <= kind <= 0xEF or kind == 0xFE):
-            kept += part
-        position = end
-    scans = content[position:]
-    return kept + scans[: scans.find(b"\xff\xd9") + 2 or None]
-
-
-def _segments_of_jpeg(content: bytes) -> Iterator[tuple[int, int]]:
-    """Kind and end of each segment before the first scan."""
-    position = 2  # after the start-of-image mark come segments: FF, kind, length (2 bytes)
-    while content[position : position + 1] == b"\xff" and content[position + 1] != 0xDA:
-        kind = content[position + 1]
-        position += 2 + int.from_bytes(content[position + 2 : position + 4], "big")
-        yield kind, position
 
 
 def _spec_of_preview(path: Path, rgb8: Byte) -> Any:
@@ -426,7 +407,7 @@ def pixels_of(path: Path, source: Any) -> Float:
         # The decoder paints what is missing grey and only warns; look for the end mark. It is
         # searched after the first scan starts: a thumbnail in the header has one of its own.
         content = path.read_bytes()
-        position = max((end for _, end in _segments_of_jpeg(content)), default=2)
+        position = max((end for _, end in segments_of_jpeg(content)), default=2)
         if content.find(b"\xff\xd9", position) < 0:
             raise ImageRefused(
                 f"{path}: truncated (no end-of-image mark). Copy or export it again. "
@@ -484,10 +465,24 @@ def refuse_other(path: Path, staged: Path, pixels: Float | Byte, *, holes: bool 
         cause = None
     except ImageRefused as error:
         cause = error
-    raise EnvironmentFailure(
+    raise _not_as_written(path) from cause
+
+
+def _refuse_other_jpeg(path: Path, staged: Path, spec: Any, rgb8: Byte) -> None:
+    """The same of a JPEG, which reads back as other pixels: it is written once more elsewhere."""
+    with scratch_folder(path) as folder:
+        again = folder / staged.name
+        write_image(path, again, spec, np.ascontiguousarray(rgb8))
+        content = staged.read_bytes()
+        if content != again.read_bytes() or not content.endswith(END):
+            raise _not_as_written(path)
+
+
+def _not_as_written(path: Path) -> EnvironmentFailure:
+    return EnvironmentFailure(
         f"{path}: the file does not read back as it was written. Free disk space or check the "
         "disk, then run the same command again. [image.write]"
-    ) from cause
+    )
 
 
 def _message(speaker: Any) -> str:

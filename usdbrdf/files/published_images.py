@@ -18,13 +18,8 @@ import OpenImageIO as oiio
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.atomic import publish, temporary_beside
 from usdbrdf.files.colour import chromaticities_of
-from usdbrdf.files.images import (
-    jpeg_without_metadata,
-    open_image,
-    pixels_of,
-    refuse_other,
-    write_image,
-)
+from usdbrdf.files.images import open_image, pixels_of, refuse_other, write_image
+from usdbrdf.files.jpeg_bytes import JPEG_SUFFIXES, jpeg_without_metadata
 from usdbrdf.model.arrays import Float
 
 _TILE = 64
@@ -42,7 +37,7 @@ _ABOUT_PIXELS = re.compile(
 _HDR_LINES = re.compile(rb"FORMAT=|EXPOSURE=|COLORCORR=|PRIMARIES=|PIXASPECT=")
 # What programs expect behind which name, as OpenImageIO calls it.
 _NAMED = {
-    "jpeg": frozenset({".jpg", ".jpeg"}),
+    "jpeg": JPEG_SUFFIXES,
     "hdr": frozenset({".hdr", ".pic"}),
     "openexr": frozenset({".exr"}),
     "tiff": frozenset({".tif", ".tiff"}),

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from usdbrdf.errors import EnvironmentFailure
+
+# Which numba looks for in the current folder, and obeys.
+_SETTINGS = Path(".numba_config.yaml")
 
 
 def refuse_unusable_settings() -> None:
     """EnvironmentFailure where kernels would not be compiled, which then find nothing, or where
     numba does not start."""
+    if _SETTINGS.is_file():  # a capture by others may bring one along
+        raise EnvironmentFailure(
+            f"{_SETTINGS.absolute()}: numba, which compiles our code, would take settings from "
+            "this file. Run the same command in another folder, or delete it. "
+            "[environment.compiler]"
+        )
     if number_told("NUMBA_DISABLE_JIT"):
         raise EnvironmentFailure(
             "NUMBA_DISABLE_JIT is set: without compiled code rays hit nothing. Unset it. "

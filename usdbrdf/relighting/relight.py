@@ -160,6 +160,8 @@ def _check(options: RelightOptions, output: Path, asset: Asset) -> None:
         )
     if suffix == SUFFIX:
         _refuse_options_of_pictures(options)
+    else:
+        _refuse_what_has_no_effect(options, suffix)
     _refuse_taken(output, folder=many and suffix != SUFFIX)
     asset.refuse_output(output, "relight.output")
     lights = options.lights
@@ -200,6 +202,24 @@ def _refuse_options_of_pictures(options: RelightOptions) -> None:
                 f"--{name}: is of pictures, and {SUFFIX} is a scene. Leave it out, or name a "
                 "picture with -o. [relight.scene]"
             )
+
+
+def _refuse_what_has_no_effect(options: RelightOptions, suffix: str) -> None:
+    """UsageError for options of other pictures than those that are asked for."""
+    many = options.views is not None
+    for name in ("camera", "frame"):
+        if many and getattr(options, name) is not None:
+            raise UsageError(f"--views, --{name}: they exclude each other. [usage.option]")
+    if not many and options.format != RelightOptions().format:
+        raise UsageError(
+            f"--format {options.format}: is of the pictures of --views; without them the ending "
+            "of -o says what is written. Leave it out. [usage.option]"
+        )
+    if options.exposure is not None and (f".{options.format}" if many else suffix) in LINEAR:
+        raise UsageError(
+            "--exposure: is of .png and .jpg, and .exr holds radiance as it is. Leave it out, or "
+            "ask for another picture. [usage.option]"
+        )
 
 
 def _refuse_taken(path: Path, *, folder: bool) -> None:
