@@ -71,8 +71,7 @@ def test_a_table_that_a_spreadsheet_has_saved(tmp_path, room):
 
 
 @pytest.mark.parametrize(
-    "beside",
-    ["#name,x,y,alt", "Name;X;Y;Alt;Accuracy XY", "#name,x,y,alt,yaw,pitch,roll"],
+    "beside", ["#name,x,y,alt", "Name;X;Y;Alt;Accuracy XY", "#name,x,y,alt,yaw,pitch,roll"]
 )
 def test_places_of_points_and_of_a_flight_are_no_cameras(tmp_path, room, beside):
     """Control points, and what a drone logs, which people keep beside the registration."""
