@@ -298,7 +298,8 @@ def what_lies_there(path: Path) -> str:
     scans = [file for file in files if file.suffix.lower() == ".e57"]
     if scans:
         return (
-            f"{scans[0].name} is an E57 without pictures. Export the stations with their photographs"
+            f"{scans[0].name} is an E57 without pictures. Export the stations with their "
+            "photographs"
             if len(scans) == 1
             else f"it holds {len(scans)} E57 files, first {scans[0].name}. Name the one whose "
             "stations took the pictures"

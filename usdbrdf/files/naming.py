@@ -62,9 +62,9 @@ def readable_label(label: str) -> str:
 def meant_by(
     wanted: PurePosixPath, stem: str, paths: Sequence[PurePosixPath]
 ) -> list[PurePosixPath]:
-    """Those of ``paths`` that a document means by ``wanted``, or by a file called ``stem`` beside it
-    of any kind: the path itself, else those that end with it, else, as it may come from another
-    machine, those that it ends with."""
+    """Those of ``paths`` that a document means by ``wanted``, or by a file of any kind there that
+    is called ``stem``: the path itself, else those that end with it, else, as it may come from
+    another machine, those that it ends with."""
     any_kind = wanted.parent / stem
     searches: tuple[Callable[[PurePosixPath], bool], ...] = (
         lambda p: p == wanted,

@@ -1,7 +1,8 @@
 """E57: pictures taken at the stations of a laser scanner, with their poses, and a mesh beside.
 
 The file holds the pictures inside; they are looked for as files beside it, under the names that
-they have there, with _ for what no file may be called. Pinholes look down -z with y up; whole spheres have x straight ahead and z up.
+they have there, with _ for what no file may be called. Pinholes look down -z with y up; whole
+spheres have x straight ahead and z up.
 """
 
 from __future__ import annotations
@@ -131,9 +132,9 @@ def _warn_of_masks(
     unmasked = {record.name for record in records if record.mask_path is None}
     if count := sum(each.is_masked and each.name in unmasked for each in taken):
         findings.warn(
-            f"{source.name}: {count} pictures have a mask inside the file (imageMask), which is not "
-            "read. Extract it into a folder masks beside it, under the picture's name, if it hides "
-            "more than what is black. [capture.mask]"
+            f"{source.name}: {count} pictures have a mask inside the file (imageMask), which is "
+            "not read. Extract it into a folder masks beside it, under the picture's name. "
+            "[capture.mask]"
         )
 
 
