@@ -188,6 +188,30 @@ def test_paths_of_another_machine_tell_pictures_of_one_name_apart(tmp_path):
     assert pictures.named("/home/me/0001.jpg") is None
 
 
+@pytest.mark.parametrize(
+    ("label", "found"),
+    [
+        ("RIG/0/img_1.JPG", "rig/0/IMG_1.jpg"),
+        ("rig/1/IMG_1", "rig/1/img_1.JPG"),
+        ("D:\\Scan\\Rig\\1\\IMG_1.png", "rig/1/img_1.JPG"),
+        ("IMG_1.jpg", "rig/0/IMG_1.jpg"),
+        ("img_1.jpg", "rig/1/img_1.JPG"),
+        ("Img_1.jpg", None),
+        ("twice.jpg", "twice.jpg"),
+        ("Twice.jpg", None),
+        ("other.jpg", "rig/Other.jpeg"),
+    ],
+)
+def test_programs_of_windows_call_pictures_in_other_letters(tmp_path, label, found):
+    """Exact letters come first; what differs in case alone is nobody's under a third spelling."""
+    files = ("rig/0/IMG_1.jpg", "rig/1/img_1.JPG", "twice.jpg", "TWICE.jpg", "rig/Other.jpeg")
+    for i, name in enumerate(files):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        _write_bytes(tmp_path / name, np.full((4, 4, 3), i, np.uint8))
+    named = pictures_of(tmp_path.parent, IngestOptions(frames=tmp_path)).named(label)
+    assert named == (found and tmp_path / found)
+
+
 @pytest.mark.parametrize("place", ["/home/me/scan/", "C:\\Users\\me\\scan\\", "../fox/"])
 def test_frames_named_where_they_lay_on_another_machine_need_their_folder(made, place):
     _rename(made, place + "frames/{:04d}.exr")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from usdbrdf.capture.lightings import (
     refuse_other_scenes,
     scan_of_lightings,
 )
+from usdbrdf.cli import main
 from usdbrdf.command_parser import parsed
 from usdbrdf.commands import COMMANDS
 from usdbrdf.errors import InputRefused, UsageError
@@ -223,3 +225,18 @@ def test_the_share_of_rays_that_hit_is_no_sum(pair):
     scans = _scans(*(made.folder for made in pair))
     shares = [scan.counts["rays_hit_percent"] for scan in scans.values()]
     assert scan_of_lightings(scans, CREASE).counts["rays_hit_percent"] == min(shares)
+
+
+def test_what_is_true_of_all_lightings_is_told_once(tmp_path, capsys):
+    """Of documents of one name."""
+    for name in ("day", "night"):
+        made = make_capture(tmp_path / name, frames=10)
+        with edited(made.manifest) as document:
+            for frame in document["frames"]:
+                del frame["saturation_radiance"]
+    folders = [str(tmp_path / name) for name in ("day", "night")]
+    assert main(["ingest", *folders, "-o", str(tmp_path / "out"), "--json"]) == 0
+    told, err = capsys.readouterr()
+    warnings = json.loads(told)["steps"]["ingest"]["warnings"]
+    (said,) = [s for s in warnings if "10 of 10 frames state no saturation" in s]
+    assert err.count(said) == 1

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.capture.test_scan_from_blocks_exchange import _document as _block
+from tests.capture.test_scan_from_blocks_exchange import _write as _write_block
 from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image
 from tests.scenes import write_ply
 from usdbrdf.capture.adapters import choose_adapter, read_scan
@@ -42,12 +44,13 @@ def _pose(matrix):
     return {"rotation": {"w": w, "x": x, "y": y, "z": z}, "translation": place}
 
 
-def _write(path, pictures):
+def _write(path, pictures, remark=""):
     file = libe57.ImageFile(str(path), "w")
     file.extensionsAdd("", libe57.E57_V1_0_URI)
     file.extensionsAdd("dist", "http://www.libe57.org/E57_LEICA_Camera_Distortion.txt")
     root = file.root()
     root.set("formatName", libe57.StringNode(file, "ASTM E57 3D Imaging Data File"))
+    root.set("coordinateMetadata", libe57.StringNode(file, remark))
     images = libe57.VectorNode(file, True)
     root.set("images2D", images)
     for picture in pictures:
@@ -155,6 +158,67 @@ def test_pinholes_that_bend_light_by_the_extension(survey, room, off):
     np.testing.assert_allclose(pixel, [cx + fx * u + right, cy + fy * v + down], atol=1e-9)
 
 
+def test_masks_beside_are_used_and_those_inside_told(survey, room):
+    pictures = _pinholes(room)
+    for picture in pictures[:4]:
+        # A blob, which holds a PNG, but nothing reads it.
+        shown = picture["pinholeRepresentation"]
+        picture["pinholeRepresentation"] = {**shown, "imageMask": "blob"}
+    _write(survey / "scan.e57", pictures)
+    half = np.ones((HEIGHT, WIDTH, 3))
+    half[: HEIGHT // 2] = 0
+    write_image(survey / "masks" / "station 0.png", half)
+    scan = read_scan(survey, OPTIONS)
+    assert [mask is not None for mask in scan.frames.masks] == [True] + 9 * [False]
+    (told,) = [s for s in scan.warnings if "imageMask" in s]
+    assert told.startswith("scan.e57: 3 pictures have a mask inside")
+    assert not any("nothing is masked" in sentence for sentence in scan.warnings)
+
+
+def test_names_that_no_file_may_have_are_found_with_underscores(survey, room):
+    pictures = [{**p, "name": f"scans/1:station {i}?"} for i, p in enumerate(_pinholes(room))]
+    _write(survey / "scan.e57", pictures)
+    for i in range(len(pictures)):
+        image = survey / "images" / f"station {i}.jpg"
+        image.rename(image.with_stem(f"scans_1_station {i}_"))
+    assert_same(read_scan(survey, OPTIONS), room)
+
+
+def test_pictures_without_a_name_and_on_a_cylinder_are_told_as_such(survey, room):
+    pictures = _pinholes(room)
+    del pictures[0]["name"]
+    round_about = {"imageWidth": WIDTH, "imageHeight": HEIGHT, "radius": 1.0, "pixelWidth": 0.01}
+    shown = {**pictures[1], "cylindricalRepresentation": round_about}
+    del shown["pinholeRepresentation"]
+    pictures[1] = shown
+    _write(survey / "scan.e57", pictures)
+    scan = read_scan(survey, OPTIONS)
+    assert_same(scan, room, poses=room.world_from_camera[2:])
+    dropped = [s for s in scan.warnings if "1 of 10 frames dropped" in s]
+    assert [s for s in dropped if "'a picture': the E57 gives it no name" in s]
+    assert [s for s in dropped if "'station 1': a cylindrical picture" in s]
+
+
+def test_of_several_files_one_is_to_be_named(survey, room):
+    (survey / "scan.e57").rename(survey / "outside.E57")
+    (survey / "inside.e57").write_bytes((survey / "outside.E57").read_bytes())
+    with pytest.raises(InputRefused, match=r"holds 2 E57 files, first inside.e57\. Name the one"):
+        choose_adapter(survey)
+    _write(survey / "inside.e57", [])
+    assert_same(read_scan(survey, OPTIONS), room)
+    with pytest.raises(InputRefused, match=r"inside.e57: an E57 without pictures.*capture.frames"):
+        read_scan(survey / "inside.e57", OPTIONS)
+
+
+@pytest.mark.parametrize("remark", ["", 5000 * "far "])
+def test_a_laser_scan_beside_another_capture_is_not_the_capture(tmp_path, room, remark):
+    """However many pages its text has, each with a checksum."""
+    folder = tmp_path / "block"
+    _write_block(folder, room, _block(room))
+    _write(folder / "scan.e57", [], remark)
+    assert choose_adapter(folder).name == "blocks-exchange"
+
+
 def test_a_lens_of_another_model_is_told(survey, room):
     _write(survey / "scan.e57", _bent(room, "Kannala", room.intrinsics[0]))
     with pytest.raises(InputRefused, match=r"its lens is distorted by a model.*'Kannala'"):
@@ -190,7 +254,7 @@ def _damaged(survey, room):
     [
         (_no_mesh, r"no mesh\. An E57 holds points.*--mesh\. \[mesh.missing\]"),
         (_inside, r"its 10 pictures.*inside the file.*--frames\. \[capture.frames\]"),
-        (_no_images2d, r"an E57 without pictures.*\[capture.frames\]"),
+        (_no_images2d, r"scan.e57 is an E57 without pictures.*\[adapter.none\]"),
         (_no_poses, r"only 5 of 10 frames.*without pose.*\[capture.camera\]"),
         (_damaged, r"damaged or no E57 file.*\[e57.read\]"),
     ],

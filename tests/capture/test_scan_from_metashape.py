@@ -296,6 +296,36 @@ def test_lenses_image_points_where_agisofts_do(tmp_path, room, kind):
     np.testing.assert_allclose(seen, _agisoft(points, kind, numbers), atol=1e-6)
 
 
+def test_photoscan_has_two_focal_lengths_and_counts_from_the_corner(tmp_path, room):
+    """After the manual of Agisoft Lens 0.4, whose P1 and P2 are OpenCV's, and Agisoft's own word
+    that F is fy, B1 is fx - fy and B2 the skew."""
+    fx, fy, cx, cy = room.intrinsics[0]
+    terms = {"k1": -0.1, "k2": 0.02, "k3": -0.003, "p1": 0.004, "p2": -0.006, "skew": 0.4}
+    document, sensors, cameras = _chunk()
+    document.set("version", "1.1.0")
+    _sensor(sensors, 0, fx=fx, fy=fy, cx=cx, cy=cy, **terms)
+    for i, pose in enumerate(room.opencv):
+        camera = _child(cameras, "camera", id=str(i), sensor_id="0", label=f"DSC{i:04d}")
+        _child(camera, "transform", _text(_in_chunk(pose)))
+    folder = _write(tmp_path / "project", document, room)
+    records = frame_records(
+        folder / "cameras.xml", pictures_of(folder, OPTIONS), OPTIONS, Findings()
+    )
+    x, y = 0.31, -0.23
+    r2 = x * x + y * y
+    radial = 1 - 0.1 * r2 + 0.02 * r2**2 - 0.003 * r2**3
+    across = x * radial - 0.006 * (r2 + 2 * x * x) + 2 * 0.004 * x * y
+    down = y * radial + 0.004 * (r2 + 2 * y * y) - 2 * 0.006 * x * y
+    pixel = records[0].lens.project(np.array([x, -y, -1.0]), records[0].intrinsics)
+    np.testing.assert_allclose(pixel, [cx + across * fx + down * 0.4, cy + down * fy], atol=1e-9)
+    for calibration in document.iter("calibration"):
+        for name in terms:
+            for term in calibration.findall(name):
+                calibration.remove(term)
+    (tmp_path / "plain").mkdir()
+    assert_same(read_scan(_write(tmp_path / "plain", document, room), OPTIONS), room)
+
+
 def test_a_spherical_sensor_needs_no_calibration(tmp_path, room):
     document, sensors, cameras = _chunk()
     _sensor(sensors, 0, "spherical")

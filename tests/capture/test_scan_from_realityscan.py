@@ -70,6 +70,18 @@ def test_a_table_that_a_spreadsheet_has_saved(tmp_path, room):
     assert_same(read_scan(folder, OPTIONS), room, names=room.names)
 
 
+@pytest.mark.parametrize(
+    "beside", ["#name,x,y,alt", "Name;X;Y;Alt;Accuracy XY", "#name,x,y,alt,yaw,pitch,roll"]
+)
+def test_places_of_points_and_of_a_flight_are_no_cameras(tmp_path, room, beside):
+    """Control points, and what a drone logs, which people keep beside the registration."""
+    folder = write_table(write_pictures(tmp_path / "scan", room), room)
+    by = ";" if ";" in beside else ","
+    row = by.join(["P1", *"1234567"[: beside.count(by)]])
+    (folder / "a points.csv").write_text(f"{beside}\n{row}\n{row}\n")
+    assert_same(read_scan(folder, OPTIONS), room, names=room.names)
+
+
 def _with_decimal_commas(text):
     return text.replace(",", ";").replace(".jpg", "?jpg").replace(".", ",").replace("?jpg", ".jpg")
 
@@ -144,6 +156,18 @@ def test_sidecars_lie_beside_their_pictures_in_any_folder_of_these(tmp_path, roo
     order = [0, 2, 4, 6, 1, 3, 5, 7, 9]
     assert_same(scan, room, poses=room.world_from_camera[order], names=room.names)
     assert [s for s in scan.warnings if "'rig/0/IMG_4': no picture" in s]
+
+
+def test_sidecars_may_be_called_in_capitals(tmp_path, room):
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=True)
+    (folder / "images" / "rig").mkdir()
+    for i in range(10):
+        for kind, named in (("jpg", "JPG"), ("xmp", "XMP")):
+            below = folder / "images" / ("rig" if i % 2 else "")
+            (folder / "images" / f"IMG_{i:04d}.{kind}").rename(below / f"{i // 2}.{named}")
+    assert choose_adapter(folder).name == "realityscan"
+    order = [*range(0, 10, 2), *range(1, 10, 2)]
+    assert_same(read_scan(folder, OPTIONS), room, poses=room.world_from_camera[order])
 
 
 @pytest.mark.parametrize("first", [False, True])

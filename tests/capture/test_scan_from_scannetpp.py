@@ -343,6 +343,17 @@ def test_a_document_within_a_scene_names_the_scene(scene, room):
         read_scan(scene / "dslr" / "nerfstudio", OPTIONS)
 
 
+def test_a_model_within_a_scene_names_the_scene(scene, room):
+    """From above, where one keeps several scenes, and from the folder of its photographs."""
+    with pytest.raises(InputRefused, match=rf"{scene.name}/ in it is one \(scannetpp\). Name that"):
+        choose_adapter(scene.parent)
+    said = rf"no mesh\. Name the scene of ScanNet\+\+, {scene}, which has one in scans/"
+    with pytest.raises(InputRefused, match=said):
+        read_scan(scene / "dslr", OPTIONS)
+    mesh = scene / "scans" / "mesh_aligned_0.05.ply"
+    assert_same(read_scan(scene / "dslr", replace(OPTIONS, mesh=mesh)), room)
+
+
 def test_the_document_alone_has_its_axes_undone_and_its_test_frames(tmp_path, room):
     _write_nerfstudio(tmp_path, room, bad=(3,))
     for i, image in enumerate(room.images):

@@ -293,6 +293,7 @@ def test_what_cannot_be_shared_is_told_before_any_work(
     [
         ("filecache::s3://scans/some", "is a chain of stores. Give .* alone, s3://scans/some"),
         ("simplecache::zip://a::gs://b", "is a chain of stores. Give .* alone, gs://b"),
+        ("S3://scans/Some", "a kind of store is written in small letters. Give s3://scans/Some"),
         ("s3://bad!bucket/some", "no bucket can be called so"),
         ("s3a://b\u00fccher", "no bucket can be called so"),
         ("hdfs:///some", "names no bucket or host"),

@@ -1,4 +1,5 @@
-"""In which frame a mesh lies: where the points lie on it that its photographs share."""
+"""In which frame a mesh lies: where the points lie on it that its photographs share, and in which
+scene of several cameras a document stands whose own mesh is that of the scene."""
 
 from __future__ import annotations
 
@@ -22,6 +23,16 @@ _PLACES, _MOST_FACES, _MOST_POINTS, _FEWEST_POINTS = 100_000, 500_000, 20_000, 3
 _ON_IT, _CLEARLY = 0.1, 3.0
 # Of a mesh that its cameras see as it is. Beyond it lies elsewhere, or is but a part of the scene.
 _FITS = 0.05
+# Folders of a scene of ScanNet++, which hold nerfstudio/ and colmap/.
+_OF_SCANNETPP = ("dslr", "iphone")
+
+
+def scene_above(document: Path) -> Path | None:
+    """The folder of the scene of ScanNet++ that a document is a part of, None of any other."""
+    scene = document.parents[min(2, len(document.parents) - 1)]
+    kind, camera = document.parent.name, document.parent.parent.name
+    apart = kind in ("nerfstudio", "colmap") and camera in _OF_SCANNETPP
+    return scene if apart and (scene / "scans").is_dir() else None
 
 
 class Lies(NamedTuple):

@@ -295,6 +295,15 @@ def what_lies_there(path: Path) -> str:
             f"it holds {len(stages)} USD files, first {stages[0].name}. Name the one that has "
             "cameras and meshes"
         )
+    scans = [file for file in files if file.suffix.lower() == ".e57"]
+    if scans:
+        return (
+            f"{scans[0].name} is an E57 without pictures. Export the stations with their "
+            "photographs"
+            if len(scans) == 1
+            else f"it holds {len(scans)} E57 files, first {scans[0].name}. Name the one whose "
+            "stations took the pictures"
+        )
     pictures = sum(file.suffix.lower() in _PICTURES for file in files)
     meshes = [file for file in files if file.suffix.lower() in _MESHES]
     held = f"{pictures} picture{'s' * (pictures != 1)}" if pictures else ""

@@ -69,7 +69,10 @@ def _is_address(text: str) -> bool:
 
 def _why_no_store(url: str) -> str:
     """Why nobody could share it, and what to give; "" where somebody may."""
-    if "::" in url.partition("://")[0]:
+    kind, _, rest = url.partition("://")
+    if "::" not in kind and kind != kind.lower():
+        return f"a kind of store is written in small letters. Give {kind.lower()}://{rest}"
+    if "::" in kind:
         return f"is a chain of stores. Give that at its end alone, {url.rpartition('::')[2]}"
     such = "Give a folder, or a store such as s3://BUCKET/PREFIX"
     if not _STORE.fullmatch(url):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import re
 import unicodedata
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from pathlib import PurePosixPath
 
 _MAX_LENGTH = 64
 # Device names that Windows refuses as a file's stem, whatever the extension.
@@ -56,6 +57,25 @@ def readable_label(label: str) -> str:
     """The label as USD can store it: control characters and lone surrogates become U+FFFD."""
     encodable = label.encode("utf-8", "replace").decode("utf-8")
     return "".join("\ufffd" if unicodedata.category(c) == "Cc" else c for c in encodable)
+
+
+def meant_by(
+    wanted: PurePosixPath, stem: str, paths: Sequence[PurePosixPath]
+) -> list[PurePosixPath]:
+    """Those of ``paths`` that a document means by ``wanted``, or by a file of any kind there that
+    is called ``stem``: the path itself, else those that end with it, else, as it may come from
+    another machine, those that it ends with."""
+    any_kind = wanted.parent / stem
+    searches: tuple[Callable[[PurePosixPath], bool], ...] = (
+        lambda p: p == wanted,
+        lambda p: p.with_suffix("") == any_kind,
+        lambda p: p.parts[-len(wanted.parts) :] == wanted.parts,
+        lambda p: p.with_suffix("").parts[-len(any_kind.parts) :] == any_kind.parts,
+        lambda p: wanted.parts[-len(p.parts) :] == p.parts,
+        lambda p: any_kind.parts[-len(p.parts) :] == p.with_suffix("").parts,
+    )
+    found = ([p for p in paths if search(p)] for search in searches)
+    return next(filter(None, found), [])
 
 
 def number_at_end(name: str) -> int:

@@ -39,9 +39,9 @@ def in_each_lighting(task: Callable[..., TaskResult], asset: Asset, *given: Any)
 
 
 def warned(doubts: Iterable[str]) -> list[str]:
-    """The sentences, which the user has then been told; as "warnings" of its summary they stay with
-    what the task made, for --strict."""
-    sentences = list(doubts)
+    """The sentences, each once (lightings may share what they are about), which the user has then
+    been told; as "warnings" of its summary they stay with what the task made, for --strict."""
+    sentences = list(dict.fromkeys(doubts))
     for sentence in sentences:
         warn(sentence)
     return sentences

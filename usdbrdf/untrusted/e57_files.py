@@ -5,6 +5,7 @@ Pixels stay where they are: an E57 holds JPEG and PNG files whole, and frames ar
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused
+from usdbrdf.files.atomic import raise_shortage
 from usdbrdf.model.arrays import Double
 from usdbrdf.untrusted.bounds import read_in_child
 
@@ -21,10 +23,15 @@ from usdbrdf.untrusted.bounds import read_in_child
 _PINHOLE = ("focalLength", "pixelWidth", "pixelHeight", "principalPointX", "principalPointY")
 _SPHERE = ("pixelWidth", "pixelHeight")
 _KINDS = {"pinholeRepresentation": _PINHOLE, "sphericalRepresentation": _SPHERE}
+_UNREAD_KINDS = ("cylindricalRepresentation", "visualReferenceRepresentation")
 # The extension of ASTM E2807 by which Leica says that pinholes bend light, in OpenCV's terms.
 _EXTENSION = "E57_LEICA_Camera_Distortion"
 _TERMS = ("K1", "K2", "K3", "P1", "P2", "K4", "K5", "K6")
 _CALIBRATED = ("FX", "FY", "CX", "CY")
+# Of the file: signature, version, length, where its XML begins, how long that is, size of a page,
+# of which the last bytes are a checksum.
+_HEAD, _CHECKSUM = struct.Struct("<8s2I4Q"), 4
+_LONGEST_XML = 1 << 26
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +49,7 @@ class StationPicture:
                 ()
     calibrated  fx, fy, cx, cy in pixels that these go with, () where not all are stated
     model       what the extension calls its model of the lens
+    is_masked   whether the file holds a mask of its valid pixels
     """
 
     name: str
@@ -52,6 +60,26 @@ class StationPicture:
     distortion: tuple[float, ...] = ()
     calibrated: tuple[float, ...] = ()
     model: str = ""
+    is_masked: bool = False
+
+
+def holds_no_pictures(path: Path) -> bool:
+    """Whether a sound E57 file describes none, by a glance at its text; False where nobody can
+    tell."""
+    try:
+        with path.open("rb") as file:
+            signature, *_, begin, length, page = _HEAD.unpack(file.read(_HEAD.size))
+            whole = signature == b"ASTM-E57" and page > _CHECKSUM and 0 < length < _LONGEST_XML
+            if not whole or page > _LONGEST_XML:
+                return False
+            file.seek(begin - begin % page)
+            stored = file.read(length + (length // (page - _CHECKSUM) + 2) * _CHECKSUM + page)
+    except (OSError, OverflowError, struct.error) as error:
+        raise_shortage(error)
+        return False
+    pages = (stored[i : i + page - _CHECKSUM] for i in range(0, len(stored), page))
+    text = b"".join(pages)[begin % page :][:length]
+    return text.rstrip().endswith(b"</e57Root>") and b"Representation" not in text
 
 
 def pictures_of_e57(path: Path) -> tuple[StationPicture, ...]:
@@ -86,8 +114,8 @@ def read_here(path: Path) -> tuple[StationPicture, ...]:
 def _picture(image: Any, bent: Sequence[str]) -> StationPicture:
     """One picture; ``bent`` are the prefixes by which the file declares distorted lenses."""
     bent = [prefix for prefix in bent if image.isDefined(f"{prefix}:distortion")]
-    kinds = [kind for kind in _KINDS if image.isDefined(kind)]
-    kind = kinds[0] if kinds else "visualReferenceRepresentation"
+    kinds = [kind for kind in (*_KINDS, *_UNREAD_KINDS) if image.isDefined(kind)]
+    kind = kinds[0] if kinds else _UNREAD_KINDS[-1]
     shown = image[kind] if image.isDefined(kind) else None
     pose = np.full((4, 4), np.nan)
     if image.isDefined("pose"):
@@ -100,6 +128,7 @@ def _picture(image: Any, bent: Sequence[str]) -> StationPicture:
         numbers=tuple(_number(shown, name) for name in _KINDS.get(kind, ())),
         resolution=(_whole(shown, "imageWidth"), _whole(shown, "imageHeight")),
         world_from_camera=pose,
+        is_masked=shown is not None and bool(shown.isDefined("imageMask")),
         **(_distortion(image[f"{bent[0]}:distortion"], bent[0]) if bent else {}),
     )
 

@@ -36,7 +36,7 @@ from usdbrdf.capture.formats.named_pictures import (
     path_in_capture,
     scan_of,
 )
-from usdbrdf.capture.mesh_frames import why_elsewhere
+from usdbrdf.capture.mesh_frames import scene_above, why_elsewhere
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -99,7 +99,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     objects = path_in_capture(path, "objects.json", options)
 
     def geometry() -> ScanGeometry:
-        mesh = options.mesh or _mesh(path, options)
+        mesh = options.mesh or _mesh(path, scene_above(chosen.folder / "images"), options)
         labels = options.objects or (objects if objects.is_file() else None)
         found = geometry_from_file(mesh, labels, options, findings, capture_root=path)
         if why := why_elsewhere(found.mesh, chosen.folder):
@@ -193,7 +193,11 @@ def _workspaces(path: Path) -> list[_Workspace]:
     others = (
         f for pattern in _MODELS_BELOW for f in seen_of(path.glob(pattern), below=path) if not found
     )
-    return found or [_Workspace(f, _IMAGES) for f in others if _holds_a_model_alone(f)]
+    return found or [
+        _Workspace(f, _IMAGES)
+        for f in others
+        if _holds_a_model_alone(f) and scene_above(f / "images") is None
+    ]
 
 
 def _holds_a_model_alone(folder: Path) -> bool:
@@ -365,10 +369,14 @@ def world_from_camera(camera_from_world: Double) -> Double:
     return pose
 
 
-def _mesh(path: Path, options: CaptureOptions) -> Path:
+def _mesh(path: Path, scene: Path | None, options: CaptureOptions) -> Path:
+    """The mesh beside a model, which may be a part of a scene of ScanNet++."""
     for workspace in _WORKSPACES:
         for name in _MESHES:
             mesh = path_in_capture(path, _joined(workspace, name), options)
             if mesh.is_file():
                 return mesh
-    return mesh_beside(path, options, how="Make one with 'colmap poisson_mesher'")
+    how = "Make one with 'colmap poisson_mesher'"
+    if scene is not None:
+        how = f"Name the scene of ScanNet++, {scene}, which has one in scans/"
+    return mesh_beside(path, options, how=how)

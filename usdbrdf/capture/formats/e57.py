@@ -1,11 +1,14 @@
 """E57: pictures taken at the stations of a laser scanner, with their poses, and a mesh beside.
 
 The file holds the pictures inside; they are looked for as files beside it, under the names that
-they have there. Pinholes look down -z with y up; whole spheres have x straight ahead and z up.
+they have there, with _ for what no file may be called. Pinholes look down -z with y up; whole
+spheres have x straight ahead and z up.
 """
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -27,23 +30,27 @@ from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Lens
 from usdbrdf.options import CaptureOptions
-from usdbrdf.untrusted.e57_files import StationPicture, pictures_of_e57
+from usdbrdf.untrusted.e57_files import StationPicture, holds_no_pictures, pictures_of_e57
 
 NAME = "e57"
 DESCRIPTION = DESCRIPTIONS[NAME]
 # Pixels between principal points that are one: from the corner, or the middle of the first pixel.
 _COUNTED = 0.51
+_NO_FILE_HAS = re.compile(r'[<>:"/\\|?*]')
 # Our camera (x right, y up, looking down -z) in the frame of a sphere (x ahead, y left, z up).
 _FLIP = np.array([[0.0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def matches(path: Path) -> bool:
-    """An E57 file, or a folder with one of them."""
+    """An E57 file, or a folder with one of them that holds pictures: laser scans lie beside
+    captures of other formats too."""
     return _file_of(path) is not None
 
 
 def _file_of(path: Path) -> Path | None:
     files = files_of(path, [".e57"])
+    if path.is_dir():
+        files = [file for file in files if not holds_no_pictures(file)]
     return files[0] if len(files) == 1 else None
 
 
@@ -65,7 +72,11 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "Extract them into a folder images beside it, each under its name (CloudCompare and "
             "e57unpack do), or name the folder with --frames. [capture.frames]"
         )
-    records = frame_records(taken, pictures, findings)
+    records = [
+        replace(r, mask_path=pictures.mask_of(r.image_path, folder, options))
+        for r in frame_records(taken, pictures, findings)
+    ]
+    _warn_of_masks(taken, records, findings, source)
     warn_of_radiance(pictures.instead, findings, source)
     mesh = partial(
         mesh_beside,
@@ -91,7 +102,12 @@ def frame_records(
                 why = f"its lens is distorted by a model that is not read ({each.model[:40]!r})"
             findings.drop(each.name, why, "capture.camera")
             continue
-        image = pictures.named(each.name) if each.name else None
+        if not each.name:
+            findings.drop(
+                "a picture", "the E57 gives it no name to find its file by", "capture.file"
+            )
+            continue
+        image = pictures.named(each.name) or pictures.named(_NO_FILE_HAS.sub("_", each.name))
         if image is None:
             drop_without_picture(each.name, findings)
             continue
@@ -107,6 +123,19 @@ def frame_records(
             )
         )
     return records
+
+
+def _warn_of_masks(
+    taken: tuple[StationPicture, ...], records: list[FrameRecord], findings: Findings, source: Path
+) -> None:
+    """One sentence where masks are inside the file, and none is beside it."""
+    unmasked = {record.name for record in records if record.mask_path is None}
+    if count := sum(each.is_masked and each.name in unmasked for each in taken):
+        findings.warn(
+            f"{source.name}: {count} pictures have a mask inside the file (imageMask), which is "
+            "not read. Extract it into a folder masks beside it, under the picture's name. "
+            "[capture.mask]"
+        )
 
 
 def _camera(each: StationPicture) -> tuple[Lens, tuple[float, float, float, float], Double] | None:

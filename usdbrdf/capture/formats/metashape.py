@@ -2,7 +2,9 @@
 
 A camera's transform is from the camera (OpenCV's axes) to the chunk; the chunk's transform leads on
 to the frame of exported models. Of a rig, only the master has a transform: the others stand as
-their sensors say, seen from the master's. Principal points are offsets from the picture's middle.
+their sensors say, seen from the master's. Principal points are offsets from the picture's middle;
+PhotoScan before 1.2 wrote fx, fy and skew, the principal point from the corner, and P1 and P2 as
+OpenCV has them.
 """
 
 from __future__ import annotations
@@ -302,7 +304,7 @@ def _sensor(sensor: Element, source: Path) -> _Sensor | None:
             f"{named} is a {kind!r} camera (known: {', '.join(_CURVES)}, spherical). Undistort the "
             "pictures in Metashape and export the cameras again. [capture.camera]"
         )
-    said = {name: _number(adjusted, name) for name in _NUMBERS}
+    said = _of_photoscan(adjusted, resolution) or {n: _number(adjusted, n) for n in _NUMBERS}
     focal, across = said["f"], said["f"] + said["b1"]
     if not min(focal, across) > 0 or said["p3"] or said["p4"]:
         raise InputRefused(
@@ -345,6 +347,19 @@ def _offset(sensor: Element) -> Double:
 
 _SIDES = ("width", "height")
 _NUMBERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+
+
+def _of_photoscan(adjusted: Element, resolution: tuple[int, int]) -> dict[str, float] | None:
+    """The numbers of a calibration with fx and fy, as those of Metashape; None of another."""
+    if adjusted.find("fx") is None:
+        return None
+    old = {name: _number(adjusted, name) for name in ("fx", "fy", "skew", *_NUMBERS)}
+    width, height = resolution
+    return old | {
+        "f": old["fy"], "b1": old["fx"] - old["fy"], "b2": old["skew"],
+        "cx": old["cx"] - width / 2, "cy": old["cy"] - height / 2,
+        "p1": old["p2"], "p2": old["p1"],
+    }  # fmt: skip
 
 
 def _number(adjusted: Element, name: str) -> float:

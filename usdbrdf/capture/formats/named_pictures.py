@@ -26,7 +26,7 @@ from usdbrdf.capture.parts import (
 from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
-from usdbrdf.files.naming import number_at_end
+from usdbrdf.files.naming import meant_by, number_at_end
 from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
@@ -88,31 +88,25 @@ class Pictures:
     instead: dict[Path, Path] = field(default_factory=dict)
 
     def named(self, label: str) -> Path | None:
-        """The picture of this name: by its path below the folder, else by the end of its path, else
-        by its name alone, each with its suffix or another; of a photograph with radiance beside
-        it that; None where there is none or several."""
-        wanted = PurePosixPath(_composed(label).replace("\\", "/").lstrip("./"))
-        known = [name for name in _names_without_suffix(wanted.name) if name in self._by_stem]
-        if not known:
+        """The picture of this name: by its path below the folder, else by the end of its path, each
+        in these letters, else in others, else by its name alone, with its suffix or another; of a
+        photograph with radiance beside it that; None where there is none or several."""
+        written = PurePosixPath(_composed(label).replace("\\", "/").lstrip("./"))
+        names = _names_without_suffix(written.name)
+        stem = next((name for name in names if name.lower() in self._by_stem), None)
+        if stem is None:
             return None
-        stem = wanted.parent / known[0]
-        searches: tuple[Callable[[PurePosixPath], bool], ...] = (
-            lambda p: p == wanted,
-            lambda p: p.with_suffix("") == stem,
-            lambda p: p.parts[-len(wanted.parts) :] == wanted.parts,
-            lambda p: p.with_suffix("").parts[-len(stem.parts) :] == stem.parts,
-            # A path from another machine ends with that below the folder.
-            lambda p: wanted.parts[-len(p.parts) :] == p.parts,
-            lambda p: stem.parts[-len(p.parts) :] == p.with_suffix("").parts,
-            lambda p: True,
-        )
-        candidates = self._by_stem[stem.name]
-        for search in searches:
-            found = [path for path, relative in candidates if search(relative)]
-            if found:
-                path = nearest_to_radiance(found)
-                return path and _or_radiance(path, [p for p, _ in candidates], self.instead)
-        return None
+        candidates = self._by_stem[stem.lower()]
+        found: list[Path] = []
+        for change in (str, str.lower):
+            path_of = {PurePosixPath(change(str(p))): path for path, p in candidates}
+            # Of paths that differ in case alone nobody knows which is meant.
+            if not found and len(path_of) == len(candidates):
+                wanted = PurePosixPath(change(str(written)))
+                found = [path_of[p] for p in meant_by(wanted, change(stem), list(path_of))]
+        exact = [path for path, p in candidates if p.stem == stem]
+        path = nearest_to_radiance(found or exact or [path for path, _ in candidates])
+        return path and _or_radiance(path, [p for p, _ in candidates], self.instead)
 
     def of_each_name(self) -> tuple[Path, ...]:
         """One picture of each name: of a photograph with radiance beside it that. All of them where
@@ -134,7 +128,8 @@ class Pictures:
     def mask_of(self, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
         """``mask_beside`` of a picture, or of another of its name beside it, by its path below the
         pictures' folder, else by its name alone, where no other folder has a picture of it."""
-        alike = [path for path, _ in self._by_stem[_composed(picture.stem)]]
+        candidates = self._by_stem[_composed(picture.stem).lower()]
+        alike = [path for path, p in candidates if p.stem == _composed(picture.stem)]
         beside = [path for path in alike if path.parent == picture.parent]
         names = [path.relative_to(self.folder).as_posix() for path in beside]
         if len(beside) == len(alike):
@@ -147,7 +142,7 @@ class Pictures:
         by_stem: dict[str, list[tuple[Path, PurePosixPath]]] = {}
         for path in self.paths:
             relative = PurePosixPath(_composed(path.relative_to(self.folder).as_posix()))
-            by_stem.setdefault(relative.stem, []).append((path, relative))
+            by_stem.setdefault(relative.stem.lower(), []).append((path, relative))
         return by_stem
 
     def numbered(self) -> dict[int, Path]:

@@ -38,8 +38,6 @@ from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 FILE = "dataparser_transforms.json"
 # What its exporters call their meshes, but for mesh.obj, which anybody's may be called.
 EXPORTED = ("poisson_mesh.ply", "tsdf_mesh.ply", "sdf_marching_cubes_mesh.ply")
-# Folders of a scene of ScanNet++, which hold nerfstudio/.
-_OF_SCANNETPP = ("dslr", "iphone")
 # ScanNet++'s keys for the frames it tests with, and of one that is blurred.
 TESTED, BAD = "test_frames", "is_bad"
 # Folder of the reconstruction that old documents were made of.
@@ -81,13 +79,6 @@ class Applied:
         found = pose.copy()
         found[:3, 3] /= self.scale
         return np.asarray(np.linalg.inv(self.matrix) @ found, np.float64)
-
-
-def scene_above(document: Path) -> Path | None:
-    """The folder of the scene of ScanNet++ that a document is a part of, None of any other."""
-    scene = document.parents[min(2, len(document.parents) - 1)]
-    apart = document.parent.name == "nerfstudio" and document.parent.parent.name in _OF_SCANNETPP
-    return scene if apart and (scene / "scans").is_dir() else None
 
 
 def is_bad(frame: Mapping[str, Any]) -> bool:

@@ -56,6 +56,8 @@ DESCRIPTION = DESCRIPTIONS[NAME]
 _NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 _DESCRIBED = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
 _COLUMNS = frozenset(("name", "x", "y", "alt"))
+_DIRECTIONS, _FOCAL = ("heading", "yaw"), ("f", "f_35mm", "focallength35mm")
+_XMP = "*.[xX][mM][pP]"
 _FULL_FRAME_MM = 36.0
 _NO_SKEW = 1e-6  # what scripts that write XMP leave of 0
 # Models without terms; what is read as one of Brown's is called so, brown3t2 for example.
@@ -69,20 +71,24 @@ def matches(path: Path) -> bool:
 
 
 def _tables(path: Path) -> list[Path]:
-    return [file for file in files_of(path, [".csv"]) if _is_table(file)]
+    """Tables of cameras; those of control points and flight logs only where there are no others."""
+    columns = {file: _columns(file) for file in files_of(path, [".csv"])}
+    places = [file for file, names in columns.items() if names >= _COLUMNS]
+    return [file for file in places if columns[file].intersection(_FOCAL)] or places
 
 
-def _is_table(file: Path) -> bool:
+def _columns(file: Path) -> set[str]:
+    """The names of a table's columns, none where it has not those of places."""
     lines = beginning_of_text(file).lower().splitlines()
-    words = ({word.strip(' #"') for word in re.split("[,;\t]", line)} for line in lines)
-    return any(words >= _COLUMNS for words in words)
+    names = ({word.strip(' #"') for word in re.split("[,;\t]", line)} for line in lines)
+    return next((found for found in names if found >= _COLUMNS), set())
 
 
 def _sidecars(path: Path) -> list[Path]:
     """XMP files of this program in a folder, else in those below it and all below its pictures'."""
     deep = (path / name for name in FOLDERS if name)
-    below = chain(path.glob("*/*.xmp"), *(folder.rglob("*.xmp") for folder in deep))
-    found = (sorted({*seen_of(files, below=path)}) for files in (path.glob("*.xmp"), below))
+    below = chain(path.glob(f"*/{_XMP}"), *(folder.rglob(_XMP) for folder in deep))
+    found = (sorted({*seen_of(files, below=path)}) for files in (path.glob(_XMP), below))
     return next((files for files in found if any(map(_is_sidecar, files))), [])
 
 
@@ -131,9 +137,9 @@ def records_of_table(source: Path, pictures: Pictures, findings: Findings) -> It
     for row in csv_rows(source, _COLUMNS):
         name = row.get("name", "")
         place = [number_in(row, axis) for axis in ("x", "y", "alt")]
-        angles = [number_in(row, *names) for names in (("heading", "yaw"), ("pitch",), ("roll",))]
-        focal = number_in(row, "f", "f_35mm", "focallength35mm")
-        if not {"heading", "yaw"} & row.keys():
+        angles = [number_in(row, *names) for names in (_DIRECTIONS, ("pitch",), ("roll",))]
+        focal = number_in(row, *_FOCAL)
+        if not row.keys() & _DIRECTIONS:
             raise InputRefused(
                 f"{source}: places of cameras without directions and focal lengths. {_EXPORT}. "
                 "[capture.format]"
@@ -221,7 +227,7 @@ def _name_and_picture(
     place = file.relative_to(pictures.folder) if inside else Path(file.parent.name, file.name)
     name = place.with_suffix("").as_posix()
     image = pictures.named(name)
-    own = file if image is None else image.with_suffix(".xmp")
+    own = file if image is None else image.with_suffix(file.suffix)
     return name, image if own == file or own not in all_files else None
 
 

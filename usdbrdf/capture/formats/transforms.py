@@ -25,11 +25,11 @@ from usdbrdf.capture.formats.nerfstudio_frames import (
     is_bad,
     rigid_matrix,
     rolling_shutter,
-    scene_above,
     stated_pose,
     statements_beside,
     warn_of_bad,
 )
+from usdbrdf.capture.mesh_frames import scene_above
 from usdbrdf.capture.nerfstudio_lens import lens_of_frame
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.rigid_poses import is_camera_matrix
