@@ -20,6 +20,7 @@ from usdbrdf.material.fit_views import (
     SampledObject,
     error_by_doubt,
     fit_views,
+    metal_if_opaque,
     sampled_object,
     with_doubts_of_light,
     with_what_shows_through,
@@ -240,6 +241,23 @@ def test_what_shows_through_is_held_against_a_lobe(studio: Studio, views: Views,
     assert held.contradiction == pytest.approx(share, abs=0.2)
     unsure = found._replace(evidence=0.1)  # nothing is asked about what is not measured anyway
     assert with_what_shows_through(lit.lobe, pytest.fail, SPHERE, 0, unsure) == unsure
+
+
+@pytest.mark.parametrize("share", [0.0, 0.7])
+def test_what_shows_through_is_no_metal(studio: Studio, views: Views, share: float):
+    """Of light that changes with the view as a mirror's does a pane's may, where what is before it
+    looks like what is behind it."""
+    lit = _lit_scene(studio.world, views.radiance)
+    sampled = views.sampled(lit)
+    radiance = sampled.samples.radiance + np.float32(share) * sampled.behind(SPHERE)
+    sampled = sampled._replace(samples=replace(sampled.samples, radiance=radiance))
+    found = LobeEstimate(0.4, 0.1, 0.01, 0.01, 0.0, 1.0, 0.9)
+    metal = Conductor(OF_VIEWS[0], (0.6, 0.6, 0.6), 0.01, 0.02, 2.0)
+    held, left = metal_if_opaque(lit.lobe, lambda: sampled, SPHERE, 0, found, metal)
+    assert left == (None if share else metal)
+    assert held.contradiction == pytest.approx(share, abs=0.2)
+    if not share:
+        assert held == found
 
 
 def test_many_views_find_the_material_without_knowing_the_diffuse_radiance(

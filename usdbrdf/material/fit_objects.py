@@ -32,6 +32,7 @@ from usdbrdf.material.fit_views import (
     fit_kinds,
     fit_views,
     joined_object,
+    metal_if_opaque,
     sampled_object,
     with_doubts_of_light,
     with_what_shows_through,
@@ -385,6 +386,8 @@ def fit_object(
     fitted, metal = fit_views(lobe, sampled, options.seed, first, metal=asked == METAL)
     if any(one.doubt for one in lightings):
         fitted, metal = with_doubts_of_light(lobe, sampled, options.seed, fitted, metal)
+    if metal and asked != METAL:
+        fitted, metal = metal_if_opaque(lobe, sampled, index, options.seed, fitted, metal)
     if not metal:
         fitted = with_what_shows_through(lobe, sampled, index, options.seed, fitted)
     found = ObjectFit(

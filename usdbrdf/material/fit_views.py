@@ -29,6 +29,7 @@ from usdbrdf.material.observations import Observations
 from usdbrdf.material.seen_through import radiance_behind, seen_through
 from usdbrdf.material.verdict import (
     MAX_PSI_ERROR,
+    MOST_CONTRADICTED,
     NOTHING_KNOWN,
     SOME_EVIDENCE,
     LobeEstimate,
@@ -341,10 +342,32 @@ def with_what_shows_through(
     shows through a thing for sure contradicts its being a surface."""
     if verdict_on_views(found, True).status != "measured":
         return found
-    held = sampled()
+    through = _shown_through(lobe, sampled(), index, seed, found)
+    return found._replace(contradiction=max(found.contradiction, through))
+
+
+def metal_if_opaque(
+    lobe: int,
+    sampled: Callable[[], SampledObject],
+    index: int,
+    seed: int,
+    found: LobeEstimate,
+    metal: Conductor,
+) -> tuple[LobeEstimate, Conductor | None]:
+    """The ``metal`` that the object ``index`` would be; None where what is behind it shows through
+    it, as it does through a pane: then the dielectric that was ``found`` is contradicted by that.
+    Before and behind a pane a room may look alike."""
+    through = _shown_through(lobe, sampled(), index, seed, found._replace(phi=metal.phi))
+    if through <= MOST_CONTRADICTED:
+        return found, metal
+    return found._replace(contradiction=max(found.contradiction, through)), None
+
+
+def _shown_through(
+    lobe: int, held: SampledObject, index: int, seed: int, found: LobeEstimate
+) -> float:
     basis = partial(held.basis(0, 3 * (_SEED_OF_THROUGH + seed)), lobe)
-    through = seen_through(held.samples, held.behind(index), basis, found)
-    return found._replace(contradiction=max(found.contradiction, through.at_least))
+    return seen_through(held.samples, held.behind(index), basis, found).at_least
 
 
 def error_by_doubt(sampled: SampledObject, kind: int, phi: float, psi: float, seed: int) -> float:
