@@ -196,3 +196,6 @@ def test_what_stands_in_the_sun_is_not_the_light_of_the_lamp_beside_it(tmp_path:
     assert light.estimate.determined[light.groups.lamp].all()
     found = light.lit[world.texels.of_object(10)].mean(axis=0)
     np.testing.assert_allclose(found, 8, rtol=0.25)
+    # What stands in the sun is at least as bright as where it clips, and no more is told of it.
+    assert light.estimate.determined.tolist() == [True, False]
+    np.testing.assert_array_equal(light.lit[owner == 9], lit[owner == 9])

@@ -253,6 +253,15 @@ class EstimatedRadiance:
         )
         return held
 
+    def of_lamps(self, which: Bool) -> EstimatedRadiance:
+        """The same of those of the lamps (K,), of the others nothing."""
+        none = nothing_known(len(which))
+        return EstimatedRadiance(
+            multiplier=np.where(which[:, None], self.multiplier, none.multiplier),
+            standard_error=np.where(which[:, None], self.standard_error, none.standard_error),
+            determined=self.determined & which,
+        )
+
 
 def estimate_clipped_emitters(evidence: Evidence) -> EstimatedRadiance:
     """Multipliers g_k of the lamps' lower bounds, with honest errors.

@@ -299,6 +299,8 @@ def estimate_clipped_light(
             left = groups.with_walls(wall)
             light = _reflecting(surface, lit, coverage, left, wall, environment, seed, said)
             told, _ = told_by(light, left.without(wall))
+            # Nothing is told of walls, whose light is no unknown.
+            told = told.of_lamps(~wall)
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
