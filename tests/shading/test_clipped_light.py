@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from tests.physics.surfaces import World, quad, room, world_of
+from tests.physics.surfaces import Part, World, quad, room, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
+from usdbrdf.shading import clipped_light, lamp_light
 from usdbrdf.shading.clipped_emitters import EstimatedRadiance
 from usdbrdf.shading.clipped_light import (
     ClippedGroups,
@@ -27,6 +31,7 @@ from usdbrdf.transport.sunlight import sunlight
 from usdbrdf.transport.tile_draws import independent_tiles
 
 NO_LIGHT = black_environment()
+NOTHING_SAID: Mapping[int, bool] = MappingProxyType({})
 ALBEDO = [(0.5, 0.4, 0.3), (0.8, 0.8, 0.8), (0.6, 0.6, 0.7), (0.7, 0.3, 0.2), (0.4, 0.5, 0.7)]
 ALBEDO += [(0.6, 0.6, 0.6)]
 LAMPS = [(12.0, 10.0, 7.0), (5.0, 5.5, 6.5)]
@@ -82,13 +87,14 @@ def _estimated(
     clipped: np.ndarray,
     folder: Path,
     environment: Environment = NO_LIGHT,
+    said: Mapping[int, bool] = NOTHING_SAID,
 ) -> ClippedLight:
     eyes = [np.array(eye) for eye in ((0.4, 0.4, 1.5), (3.6, 2.6, 1.5), (0.4, 2.6, 1.2))]
     frames = frames_at([look_at(eye, np.array([2.0, 1.5, 1.0])) for eye in eyes])
     surface = TexturedScene(world.scene, world.texels, world.rays)
     run = TaskRun(folder, "shade", folder / "work")
     coverage = CoverageMap.of(~clipped, clipped)
-    return estimate_clipped_light(run, surface, lit, coverage, frames, environment, 0)
+    return estimate_clipped_light(run, surface, lit, coverage, frames, environment, 0, said)
 
 
 def test_the_lamps_are_as_bright_as_their_light_says(
@@ -164,38 +170,80 @@ def test_what_nobody_saw_of_a_lamp_shines_only_if_the_lamp_is_determined():
     np.testing.assert_array_equal(light.may_shine(clipped), [False, True, True, True, False])
 
 
-def test_what_stands_in_the_sun_is_not_the_light_of_the_lamp_beside_it(tmp_path: Path):
-    """Through a hole in the ceiling the sun falls on a table, object 9, which clips at a tenth of
-    what it sends; beside it lies a lamp, object 10, that clips too and sends little."""
-    parts = room((0, 0, 0), (4, 3, 2.5), size=(16, 16))
-    around = [
-        quad((0, 0, 2.5), (0, 3, 0), (1.7, 0, 0), size=(16, 16)),
-        quad((2.3, 0, 2.5), (0, 3, 0), (1.7, 0, 0), size=(16, 16)),
-        quad((1.7, 0, 2.5), (0, 1.2, 0), (0.6, 0, 0), size=(8, 8)),
-        quad((1.7, 1.8, 2.5), (0, 1.2, 0), (0.6, 0, 0), size=(8, 8)),
-    ]
-    walls = [part for part in parts if not (part.points[:, 2] > 2.4).all()]
-    assert len(walls) == 5
-    table = quad((1.5, 1.0, 0.9), (1.0, 0, 0), (0, 1.0, 0), size=(12, 12))
-    lamp = quad((2.7, 1.1, 0.9), (0.8, 0, 0), (0, 0.8, 0))
-    world = world_of([*walls, *around, table, lamp])
-    sun = Sun(np.array([0.0, 0.0, 1.0]), np.full(3, 100.0))
-    noon = Environment(np.zeros((1, 1, 3), np.float32), True).under(sun)
-    dark = [(0.0, 0.0, 0.0)]
-    albedo = world.per_object([*ALBEDO[:5], *[(0.8, 0.8, 0.8)] * 4, (0.9, 0.9, 0.9), *dark])
-    rng = np.random.default_rng(5)
-    albedo = (albedo * np.exp(0.03 * rng.standard_normal((len(albedo), 1)))).astype(np.float32)
-    emitted = world.per_object([*dark * 10, (8.0, 8.0, 8.0)])
-    true = _shone(world, albedo, emitted, 4, noon)
-    clipped = (true >= SATURATION).any(axis=1)
-    owner = world.texels.object_index()
-    assert set(owner[clipped].tolist()) == {9, 10}
-    lit = np.where(clipped[:, None], np.float32(SATURATION), true)
-    light = _estimated(world, lit, clipped, tmp_path, noon)
+class InTheSun(NamedTuple):
+    """Through a hole in the ceiling the sun falls on what is below it, which clips at a tenth of
+    what it sends; a lamp, the last object, that clips too and sends little. What is shown, and
+    which of it clips."""
+
+    world: World
+    lit: np.ndarray
+    clipped: np.ndarray
+    noon: Environment
+
+    @classmethod
+    def of(cls, things: list[Part], size: tuple[int, int]) -> InTheSun:
+        """A room with things that are nearly white."""
+        around = [
+            quad((0, 0, 2.5), (0, 3, 0), (1.7, 0, 0), size=(16, 16)),
+            quad((2.3, 0, 2.5), (0, 3, 0), (1.7, 0, 0), size=(16, 16)),
+            quad((1.7, 0, 2.5), (0, 1.2, 0), (0.6, 0, 0), size=(8, 8)),
+            quad((1.7, 1.8, 2.5), (0, 1.2, 0), (0.6, 0, 0), size=(8, 8)),
+        ]
+        parts = room((0, 0, 0), (4, 3, 2.5), size=size)
+        walls = [part for part in parts if not (part.points[:, 2] > 2.4).all()]
+        assert len(walls) == 5
+        lamp = quad((2.7, 1.1, 0.9), (0.8, 0, 0), (0, 0.8, 0))
+        world = world_of([*walls, *around, *things, lamp])
+        sun = Sun(np.array([0.0, 0.0, 1.0]), np.full(3, 100.0))
+        noon = Environment(np.zeros((1, 1, 3), np.float32), True).under(sun)
+        dark, count = [(0.0, 0.0, 0.0)], len(things)
+        colours = [*ALBEDO[:5], *[(0.8, 0.8, 0.8)] * 4, *[(0.9, 0.9, 0.9)] * count, *dark]
+        rng = np.random.default_rng(5)
+        noise = np.exp(0.03 * rng.standard_normal((len(world.texels), 1)))
+        albedo = (world.per_object(colours) * noise).astype(np.float32)
+        emitted = world.per_object([*dark * (9 + count), (8.0, 8.0, 8.0)])
+        true = _shone(world, albedo, emitted, 4, noon)
+        clipped = (true >= SATURATION).any(axis=1)
+        return cls(world, np.where(clipped[:, None], np.float32(SATURATION), true), clipped, noon)
+
+    def estimated(self, folder: Path, said: Mapping[int, bool] = NOTHING_SAID) -> ClippedLight:
+        return _estimated(self.world, self.lit, self.clipped, folder, self.noon, said)
+
+
+@pytest.fixture(scope="module")
+def beside_table() -> InTheSun:
+    """The table is object 9, the lamp 10."""
+    return InTheSun.of([quad((1.5, 1.0, 0.9), (1.0, 0, 0), (0, 1.0, 0), size=(12, 12))], (16, 16))
+
+
+@pytest.mark.parametrize("said", [NOTHING_SAID, {9: False}])
+def test_what_stands_in_the_sun_is_not_the_light_of_the_lamp_beside_it(
+    said, beside_table: InTheSun, tmp_path: Path
+):
+    owner = beside_table.world.texels.object_index()
+    assert set(owner[beside_table.clipped].tolist()) == {9, 10}
+    light = beside_table.estimated(tmp_path, said)
     assert light.groups.object[light.groups.lamp].tolist() == [10]
     assert light.estimate.determined[light.groups.lamp].all()
-    found = light.lit[world.texels.of_object(10)].mean(axis=0)
-    np.testing.assert_allclose(found, 8, rtol=0.25)
+    np.testing.assert_allclose(light.lit[owner == 10].mean(axis=0), 8, rtol=0.25)
     # What stands in the sun is at least as bright as where it clips, and no more is told of it.
     assert light.estimate.determined.tolist() == [True, False]
-    np.testing.assert_array_equal(light.lit[owner == 9], lit[owner == 9])
+    np.testing.assert_array_equal(light.lit[owner == 9], beside_table.lit[owner == 9])
+
+
+def test_where_the_sun_falls_on_a_floor_it_is_asked_with_its_bound(tmp_path: Path, monkeypatch):
+    """What it reflects of the sun is reckoned, and no evidence of the lamp."""
+    asked = []
+
+    def looked_at_closely(*given):
+        asked.append(given[4])
+        return lamp_light.looked_at_closely(*given)
+
+    monkeypatch.setattr(clipped_light, "looked_at_closely", looked_at_closely)
+    found = InTheSun.of([], (32, 32))
+    owner = found.world.texels.object_index()
+    assert len(set(owner[found.clipped].tolist())) == 2
+    light = found.estimated(tmp_path)
+    assert light.groups.object[light.groups.lamp].tolist() == [9]
+    assert asked[-1].clipped.any()
+    np.testing.assert_allclose(asked[-1].reflected[asked[-1].clipped], np.pi * SATURATION)

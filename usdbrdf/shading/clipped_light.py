@@ -37,6 +37,7 @@ from usdbrdf.shading.clipped_emitters import (
 from usdbrdf.shading.gloss import mirrored_to_frames
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
 from usdbrdf.shading.lamp_light import Lamps, looked_at_closely
+from usdbrdf.shading.outside_light import Asked
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
@@ -274,33 +275,35 @@ def estimate_clipped_light(
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
-        none, wall = nothing_known(len(groups)), np.zeros(len(groups), np.bool_)
+        wall = np.zeros(len(groups), np.bool_)
         chosen, segment = _chosen(surface.texels, groups, coverage.measured, seed)
         if not len(chosen):
-            return {**vars(none), "wall": wall}
+            return {**vars(nothing_known(len(groups))), "wall": wall}
+
+        # With their bounds, whatever light of the sun what clips is taken to reflect.
+        asked = asked_texels(surface.texels, lit, coverage, seed)
 
         def told_by(light: Float, groups: ClippedGroups) -> tuple[EstimatedRadiance, Bool]:
             evidence = _evidence(surface, light, groups, chosen, segment, environment, seed)
             first = estimate_clipped_emitters(evidence)
-            given = surface, light, coverage, frames, environment, groups, first, seed
+            given = surface, light, asked, frames, environment, groups, first, seed
             return _told_by_even_light(*given)
 
         told, evenly = told_by(lit, groups)
         if lit_unseen or environment.sun.shines or environment.image.any():
-            by_hand = [said.get(int(i), False) for i in groups.object]
+            by_hand = np.array([said.get(int(i), -1) for i in groups.object])
             # Beside a window lamps as bright as need be take up what its light leaves unexplained:
             # where other light suffices, one must show itself in the light that it casts evenly.
-            least = np.where(evenly, told.least().max(axis=1), 1.0)
-            least = np.where(by_hand, np.inf, least)
-            given = surface, lit, coverage, frames, groups, least, environment, seed
+            # What a person says is no lamp reflects, and may do so of that light alone.
+            least = np.where(by_hand == 1, np.inf, np.where(evenly, told.least().max(axis=1), 1.0))
+            weighed = replace(groups, lamp=groups.lamp | (by_hand == 0))
+            given = surface, lit, coverage, frames, weighed, least, environment, seed
             wall = reflects_other_light(*given)
         if wall.any():
             # What the sun shines on may be many times its bound, which lamps beside it would send.
             left = groups.with_walls(wall)
             light = _reflecting(surface, lit, coverage, left, wall, environment, seed, said)
-            told, _ = told_by(light, left.without(wall))
-            # Nothing is told of walls, whose light is no unknown.
-            told = told.of_lamps(~wall)
+            told = told_by(light, left.without(wall))[0].of_lamps(~wall)
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
@@ -397,7 +400,7 @@ def _with_estimates(lit: Float, groups: ClippedGroups, estimate: EstimatedRadian
 def _told_by_even_light(
     surface: TexturedScene,
     lit: Float,
-    coverage: CoverageMap,
+    asked: Asked | None,
     frames: Frames,
     environment: Environment,
     groups: ClippedGroups,
@@ -409,7 +412,6 @@ def _told_by_even_light(
     bound, the ``first`` one. And of which (K,) it said enough."""
     told = first.determined | (first.least() > 1).any(axis=1)
     lamps = np.flatnonzero(groups.lamp & told)[:_CLOSELY]
-    asked = asked_texels(surface.texels, lit, coverage, seed)
     evenly = np.zeros(len(groups), np.bool_)
     if not len(lamps) or asked is None:
         return first, evenly
@@ -432,12 +434,7 @@ def _told_by_even_light(
     multiplier = found.radiance / bound[:, None]
     brightest = multiplier.max(axis=1)
     better = (error <= MAX_ERROR) & (np.log(brightest) > -2 * error)
-    estimate = replace(
-        first,
-        multiplier=first.multiplier.copy(),
-        standard_error=first.standard_error.copy(),
-        determined=first.determined.copy(),
-    )
+    estimate = EstimatedRadiance(**{name: kept.copy() for name, kept in vars(first).items()})
     held = multiplier / np.minimum(brightest, 1)[:, None]
     estimate.multiplier[lamps[better]] = held[better]
     estimate.standard_error[lamps[better]] = error[better, None]
