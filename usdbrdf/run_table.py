@@ -15,7 +15,7 @@ _WORDS = {
     "lamp": ("lamps", ""),
     "unfitted": ("not fitted, as a person asked", ""),
     "prior": ("not determined", "frames that see highlights on them would tell"),
-    "unseen": ("unseen", "frames show too little of them: all about them is a guess"),
+    "unseen": ("unseen", "frames show too little of them: all about them but a colour is a guess"),
     "failed": ("failed", "the target frame does not determine them"),
 }
 _NOT_FITTED = ("ignore", "glass")

@@ -329,11 +329,27 @@ def test_nothing_that_a_photograph_shows_is_said_to_be_in_none():
     assert undetermined_because(fit_of(), "unseen") == "unseen"
     told = findings({"texture": {}, "shade": {}}, ["unseen", "glimpsed", "glimpsed"], True)
     assert told[1:] == [
-        "Photographs hardly show 2: nothing on them was measured, and everything is a guess.",
+        "Photographs hardly show 2: nothing on them was measured, and everything but a colour is a "
+        "guess.",
         "No photograph shows 1 of them.",
     ]
     assert why(fit_of(), "unseen", None, in_sight=False).startswith("No photograph shows it: ")
     assert why(fit_of(), "unseen", None, in_sight=True).startswith("Photographs hardly show it")
+    assert why(fit_of(), "unseen", None, glimpsed=True) == (
+        "Photographs show it only together with what is beside it: its colour is about that, and "
+        "everything else about it is a guess."
+    )
+    texture = {"measured_fraction": 0.8, "clipped_fraction": 0.01, "glimpsed_fraction": 0.02}
+    told = findings({"texture": texture, "shade": {}}, [], True)
+    assert told[1] == (
+        "Photographs measured 80.0% of the surface; 1.00% clipped in all of them; 2.00% is too "
+        "thin for that and was glimpsed; the rest is filled in from around it."
+    )
+    told = findings({"texture": {"measured_fraction": 0.8}, "shade": {}}, [], True)
+    assert told[1] == (
+        "Photographs measured 80.0% of the surface; 0.00% clipped in all of them; the rest is "
+        "filled in from around it."
+    )
 
 
 @pytest.mark.parametrize(

@@ -242,7 +242,8 @@ class TexturedObject(UnwrappedObject):
         radiances that the lit texture stores; 0 to 1, without unit; 0.5 is the median.""",
         low=0, high=1)] = 0.5
     seen: Annotated[bool, Fact(TEXTURING, "seen", "bool", True, """False where no photograph
-        measured any texel of the object: its textures are then filled in, not measured.""")]
+        measured any texel of the object: its textures are then filled in or, where it is too thin
+        for that, about what photographs show of it together with what is beside it.""")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -391,8 +392,8 @@ class FittedObject(MeasuredObject):
     status: Annotated[str, Fact(FIT, "status", "token", "unseen", """measured: phi and psi come from
         the photographs, and their stated errors are small; prior: they do not determine both, whose
         values are the medians of what remains likely if all was equally likely before; unseen: no
-        photograph shows the object; failed: method paper alone, which keeps its minimum even where
-        the photograph does not determine it.""",
+        photograph shows enough of the object; failed: method paper alone, which keeps its minimum
+        even where the photograph does not determine it.""",
         tokens=("measured", "prior", "unseen", "failed"))]
     target_frame: Annotated[int, Fact(FIT, "targetFrame", "int", -1, """Index of the photograph that
         shows the highlight best, counted from 0 (time code minus 1); -1 where there is none.""",

@@ -178,7 +178,7 @@ def findings(
     if glimpsed := count.get("glimpsed"):
         told.append(
             f"Photographs hardly show {glimpsed}: nothing on {'it' if glimpsed == 1 else 'them'} "
-            "was measured, and everything is a guess."
+            "was measured, and everything but a colour is a guess."
         )
     if unseen := count.get("unseen"):
         told.append(f"No photograph shows {unseen if unseen < total else 'any'} of them.")
@@ -190,8 +190,8 @@ def findings(
     if "measured_fraction" in texture:
         told.append(
             f"Photographs measured {texture['measured_fraction']:.1%} of the surface; "
-            f"{texture.get('clipped_fraction', 0):.2%} clipped in all of them; the rest is filled "
-            "in from around it."
+            f"{texture.get('clipped_fraction', 0):.2%} clipped in all of them; "
+            f"{_glimpsed(texture)}the rest is filled in from around it."
         )
     if "standard_error" in shade:
         told.append(f"The traced light has a standard error of {shade['standard_error']:.1%}.")
@@ -207,6 +207,11 @@ def findings(
     if not radiometric:
         told.append("The images are not radiometric: albedo and fit have no absolute meaning.")
     return told
+
+
+def _glimpsed(texture: Mapping[str, Any]) -> str:
+    share = texture.get("glimpsed_fraction", 0)
+    return f"{share:.2%} is too thin for that and was glimpsed; " if share >= 0.00005 else ""
 
 
 def _outside(found: Mapping[str, Any] | None) -> str:

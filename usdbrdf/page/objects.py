@@ -104,6 +104,7 @@ def _numbers(
     status = status_of(atlas, index, fit)
     shading = read_shading(atlas.stage, obj.prim_path)
     observed = bool(atlas.coverage.observed[own].any())
+    glimpsed = bool(atlas.coverage.glimpsed[own].any())
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), None)
     base = texels.mean_of_object(index, atlas.map_where_present(colours, 3)) if colours else None
     return {
@@ -129,7 +130,7 @@ def _numbers(
         "clipped": round(float(atlas.coverage.clipped[own].mean()), 4),
         "area": round(float(texels.area[own].sum()), 4),
         "radiance": _radiance(shading),
-        "why": why(fit, status, shading, in_sight=in_sight, observed=observed),
+        "why": why(fit, status, shading, in_sight=in_sight, observed=observed, glimpsed=glimpsed),
         "target": fit.target_frame,
     }
 
@@ -149,11 +150,13 @@ def why(
     *,
     in_sight: bool = True,
     observed: bool = True,
+    glimpsed: bool = False,
 ) -> str:
     """In a sentence or two, why the numbers of an object are to be believed, or not.
 
     in_sight  whether it lies in the sight of a camera
     observed  whether a frame tells something of any of its texels, if only that it clips
+    glimpsed  whether frames show some of it in pixels that show something else as well
     """
     if directive := _by_directive(fit, shading):
         return directive
@@ -165,6 +168,11 @@ def why(
         what = "estimated from the light that it casts" if known == "estimated" else "a lower bound"
         return f"It shines {how}: its radiance is {what}."
     if status == "unseen":
+        if glimpsed:
+            return (
+                "Photographs show it only together with what is beside it: its colour is about "
+                "that, and everything else about it is a guess."
+            )
         hardly = "Photographs hardly show it, and nothing on it was measured"
         shown = hardly if in_sight else "No photograph shows it"
         return f"{shown}: everything about it is a guess."

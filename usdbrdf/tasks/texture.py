@@ -75,6 +75,7 @@ def texture(asset: Asset, options: TextureOptions, workers: Workers = HERE) -> T
             "texels": len(surface.texels),
             "measured_fraction": float(found.coverage.measured.mean()),
             "clipped_fraction": float(found.coverage.clipped.mean()),
+            "glimpsed_fraction": float(found.coverage.glimpsed.mean()),
             "unseen_objects": [item.identifier for item in objects if not item.seen],
             "contradicting_frames": found.contradicting,
             "warnings": doubts + found.contradictions(),

@@ -49,7 +49,7 @@ class BytesPerTexel(NamedTuple):
 
 # Running statistics (145), a texel's place among the blocks of texels while these are sorted out,
 # and what the next frames show of it; then what becomes of the results while the maps are made.
-OF_TEXTURING = BytesPerTexel(grouped=240, result=48, after=200)
+OF_TEXTURING = BytesPerTexel(grouped=240, result=49, after=200)
 
 
 def in_passes(

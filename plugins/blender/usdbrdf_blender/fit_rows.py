@@ -6,7 +6,7 @@ The usdview and the Blender plug-in are installed apart: each has its copy of th
 _STATUS = {
     "measured": "MEASURED in the photographs",
     "prior": "PRIOR, not measured: values of the object's class, with what the photographs say",
-    "unseen": "UNSEEN, not measured: no photograph shows the object",
+    "unseen": "UNSEEN, not measured: no photograph shows enough of the object",
     "failed": "FAILED, not measured: the photograph does not determine the values",
 }
 _RADIANCE = {

@@ -220,7 +220,8 @@ def test_panels(session, room):
     assert alerts(told["Stuhl_No_1"]) == ""
     wall = labels(told["wall"])
     assert "Roughness phi not known" in wall
-    assert alerts(told["wall"]) == "UNSEEN, not measured: no photograph shows the object"
+    unseen = "UNSEEN, not measured: no photograph shows enough of the object"
+    assert alerts(told["wall"]) == unseen
     assert "(8, 7, 6) ± 12%, estimated" in labels(told["lamp"])
     assert told["look"] == [["menu", "shaded", False]]
     assert {"shaded", "lit", "albedo"} <= {text for _, text, _ in told["looks"]}

@@ -204,7 +204,7 @@
     'Specular \u03c8': 'how strong they are: 0.5 is usual for wood, paint and plastics, 0 has none (what is mirrored straight ahead is 0.08 \u03c8 of the light). Of metals a colour, F0, takes its place.',
     Sure: 'how far \u03c6 and \u03c8 are to be believed: high, low, or none: a guess.',
     Evidence: 'how much of what changes from view to view the highlight explains: 0 % nothing, 100 % all.',
-    Seen: 'the share of the surface that photographs measured; the rest is filled in from around it.',
+    Seen: 'the share of the surface that photographs measured; the rest is filled in from around it or, of what is too thin for that, about what its pixels show.',
   };
   const words = (told) => el('dl', { class: 'facts' },
     ...Object.entries(told).flatMap(([word, meaning]) => [el('dt', {}, word), el('dd', {}, meaning)]));
