@@ -60,7 +60,7 @@ def readable_label(label: str) -> str:
 
 
 def meant_by(
-    wanted: PurePosixPath, stem: str, paths: Sequence[PurePosixPath]
+    wanted: PurePosixPath, stem: str, paths: Collection[PurePosixPath]
 ) -> list[PurePosixPath]:
     """Those of ``paths`` that a document means by ``wanted``, or by a file of any kind there that
     is called ``stem``: the path itself, else those that end with it, else, as it may come from

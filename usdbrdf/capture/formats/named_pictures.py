@@ -98,14 +98,15 @@ class Pictures:
             return None
         candidates = self._by_stem[stem.lower()]
         found: list[Path] = []
-        for change in (str, str.lower):
-            path_of = {PurePosixPath(change(str(p))): path for path, p in candidates}
+        for change, paths_of in zip((str, str.lower), self._paths_of, strict=True):
+            path_of = paths_of[stem.lower()]
             # Of paths that differ in case alone nobody knows which is meant.
             if not found and len(path_of) == len(candidates):
                 wanted = PurePosixPath(change(str(written)))
-                found = [path_of[p] for p in meant_by(wanted, change(stem), list(path_of))]
-        exact = [path for path, p in candidates if p.stem == stem]
-        path = nearest_to_radiance(found or exact or [path for path, _ in candidates])
+                meant = [wanted] if wanted in path_of else meant_by(wanted, change(stem), path_of)
+                found = [path_of[p] for p in meant]
+        found = found or [path for path, p in candidates if p.stem == stem]
+        path = nearest_to_radiance(found or [path for path, _ in candidates])
         return path and _or_radiance(path, [p for p, _ in candidates], self.instead)
 
     def of_each_name(self) -> tuple[Path, ...]:
@@ -144,6 +145,19 @@ class Pictures:
             relative = PurePosixPath(_composed(path.relative_to(self.folder).as_posix()))
             by_stem.setdefault(relative.stem.lower(), []).append((path, relative))
         return by_stem
+
+    @cached_property
+    def _paths_of(self) -> tuple[dict[str, dict[PurePosixPath, Path]], ...]:
+        """The same by their paths below the folder, in their own letters and in small ones: many
+        folders may have pictures of one name."""
+        written, small = (
+            {
+                stem: {PurePosixPath(change(str(p))): path for path, p in alike}
+                for stem, alike in self._by_stem.items()
+            }
+            for change in (str, str.lower)
+        )
+        return written, small
 
     def numbered(self) -> dict[int, Path]:
         """The pictures by the number at the end of their names, those without left out; of two of
