@@ -105,9 +105,7 @@ def test_photographs_that_were_copied_or_converted(tmp_path, suffix):
             photograph.rename(photograph.with_suffix(suffix))
     scan = read_scan(export, IngestOptions())
     assert len(scan.frames.world_from_camera) == len(poses)
-    np.testing.assert_array_equal(
-        scan.frames.world_from_camera, expected.frames.world_from_camera
-    )
+    np.testing.assert_array_equal(scan.frames.world_from_camera, expected.frames.world_from_camera)
 
 
 def test_a_folder_without_photographs_is_refused(tmp_path):
