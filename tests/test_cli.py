@@ -288,6 +288,7 @@ def test_where_memory_runs_out_what_asks_for_less_is_named(capsys, monkeypatch):
 @pytest.mark.fault("S9")
 def test_settings_of_the_compiler_in_the_current_folder(capture, tmp_path, capsys, monkeypatch):
     """Somebody works in a capture by others that brings some along: rays hit nothing."""
+    pytest.importorskip("yaml", reason="numba reads them with it")
     (tmp_path / ".numba_config.yaml").write_text("DISABLE_JIT: 1")
     monkeypatch.chdir(tmp_path)
     status, line = refused(capsys, "convert", capture, "-o", tmp_path / "out")

@@ -13,6 +13,7 @@ import pytest
 
 from tests.scenes import MadeCapture, edited, make_capture, write_ply
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.formats import named_pictures
 from usdbrdf.capture.formats.named_pictures import Pictures, pictures_of
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.colour import to_display_srgb8
@@ -210,6 +211,25 @@ def test_programs_of_windows_call_pictures_in_other_letters(tmp_path, label, fou
         _write_bytes(tmp_path / name, np.full((4, 4, 3), i, np.uint8))
     named = pictures_of(tmp_path.parent, IngestOptions(frames=tmp_path)).named(label)
     assert named == (found and tmp_path / found)
+
+
+def test_of_many_pictures_of_one_name_each_is_found_by_its_path_at_once(tmp_path, monkeypatch):
+    """Stations of six faces: all thousands were compared with each of them."""
+    files = [tmp_path / f"station_{i}" / "FRONT.jpg" for i in range(3)]
+    pictures = Pictures(folder=tmp_path, paths=tuple(files))
+    walked, meant_by = [], named_pictures.meant_by
+
+    class Known(dict):
+        def __iter__(self):
+            walked.append(self)
+            return super().__iter__()
+
+    def meant(wanted, stem, paths):
+        return meant_by(wanted, stem, Known.fromkeys(paths))
+
+    monkeypatch.setattr(named_pictures, "meant_by", meant)
+    assert [pictures.named(f"station_{i}/FRONT.jpg") for i in range(3)] == files
+    assert walked == []
 
 
 @pytest.mark.parametrize("place", ["/home/me/scan/", "C:\\Users\\me\\scan\\", "../fox/"])

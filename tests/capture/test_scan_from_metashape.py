@@ -165,6 +165,17 @@ def test_a_component_says_where_it_stands_before_the_chunk(tmp_path, room):
     assert_same(read_scan(_write(tmp_path / "project", document, room), OPTIONS), room)
 
 
+@pytest.mark.parametrize("encoding", ["UTF-16", "UTF-16LE", "ISO-8859-1", "windows-1252"])
+def test_a_document_is_read_in_what_it_says_that_it_is_written_in(project, room, encoding):
+    """As editors and scripts save it."""
+    document = project / "cameras.xml"
+    text = document.read_text("utf-8").replace("Chunk 1", "Fa\u00e7ade").partition("?>")[2]
+    declared = f'<?xml version="1.0" encoding="{encoding.removesuffix("LE")}"?>'
+    document.write_bytes((declared + text).encode(encoding))
+    assert choose_adapter(project).name == "metashape"
+    assert_same(read_scan(project, OPTIONS), room)
+
+
 def test_an_export_may_be_called_in_capitals(project, room):
     (project / "cameras.xml").rename(project / "CAMERAS.XML")
     assert choose_adapter(project).name == "metashape"

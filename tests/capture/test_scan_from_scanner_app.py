@@ -93,6 +93,21 @@ def test_another_mesh_can_be_chosen(tmp_path):
     assert names == ["part_001", "part_002", "part_003"]
 
 
+@pytest.mark.parametrize("suffix", [".JPG", ".jpeg", ".png"])
+def test_photographs_that_were_copied_or_converted(tmp_path, suffix):
+    export, poses = make_export(tmp_path)
+    expected = read_scan(export, IngestOptions())
+    for photograph in export.glob("*.jpg"):
+        if suffix == ".png":
+            oiio.ImageBuf(str(photograph)).write(str(photograph.with_suffix(suffix)))
+            photograph.unlink()
+        else:
+            photograph.rename(photograph.with_suffix(suffix))
+    scan = read_scan(export, IngestOptions())
+    assert len(scan.frames.world_from_camera) == len(poses)
+    np.testing.assert_array_equal(scan.frames.world_from_camera, expected.frames.world_from_camera)
+
+
 def test_a_folder_without_photographs_is_refused(tmp_path):
     export, _ = make_export(tmp_path)
     for photograph in export.glob("*.jpg"):

@@ -358,7 +358,10 @@ def test_workers_run_no_module_that_lies_in_the_current_folder(tmp_path: Path) -
     found = subprocess.run(
         [sys.executable, str(program)],
         cwd=capture,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
+        env={
+            **{name: told for name, told in os.environ.items() if name != "PYTHONSAFEPATH"},
+            "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)),
+        },
         capture_output=True,
         text=True,
     )
@@ -366,14 +369,22 @@ def test_workers_run_no_module_that_lies_in_the_current_folder(tmp_path: Path) -
     assert found.stdout.split() == ["1", "False"]
 
 
-def test_where_python_runs_modules_of_the_current_folder_they_are_refused(tmp_path: Path) -> None:
-    for innocent in ("pickled.py", "select.exr", "usdbrdf.py"):
+def test_where_python_runs_modules_of_the_current_folder_they_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for innocent in ("pickled.py", "select.exr", "usdbrdf.py", "time.py"):
         (tmp_path / innocent).touch()
     (tmp_path / "json").mkdir()
     session.refuse_modules_of(tmp_path)
     (tmp_path / "json" / "__init__.py").touch()
     with pytest.raises(EnvironmentFailure, match=r"/json: .*another folder.*\[cluster.modules\]"):
         session.refuse_modules_of(tmp_path)
+
+    def closed(self: Path) -> object:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", closed)
+    session.refuse_modules_of(tmp_path)
 
 
 def test_workers_leave_nothing_among_temporary_files(

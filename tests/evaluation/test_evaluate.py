@@ -175,20 +175,27 @@ def test_settings_of_matplotlib_in_the_current_folder_play_no_part(tmp_path):
         ("none", None),
         ("latex", b"text.usetex: True\nfigure.dpi: 7\naxes.facecolor: black\n"),
         ("no text", b"\xff\xfe"),
+        ("unread", Path("/proc/self/mem")),  # a regular file whose first byte is an error
+        ("no file", os.mkfifo),
     ):
         (place := tmp_path / name).mkdir()
-        if settings is not None:
+        if isinstance(settings, bytes):
             (place / "matplotlibrc").write_bytes(settings)
+        elif isinstance(settings, Path):
+            (place / "matplotlibrc").symlink_to(settings)
+        elif settings is not None:
+            settings(place / "matplotlibrc")
         said[name] = subprocess.run(
             [sys.executable, program, place / "plot.svg"],
             cwd=place,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
-            capture_output=True, text=True, check=True,
+            capture_output=True, text=True, check=True, timeout=300,
         ).stderr  # fmt: skip
     plots = {name: tmp_path / name / "plot.svg" for name in said}
     assert plots["latex"].read_bytes() == plots["none"].read_bytes()
-    assert not plots["no text"].exists()
-    assert "not drawn, matplotlib cannot read its settings" in said["no text"]
+    for name in ("no text", "unread", "no file"):
+        assert not plots[name].exists()
+        assert "not drawn, matplotlib cannot read its settings" in said[name]
 
 
 def test_with_it_there_is_a_plot(found):

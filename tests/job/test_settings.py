@@ -45,6 +45,21 @@ def test_settings_of_the_compiler(monkeypatch, name, value, refused):
         refuse_unusable_settings()
 
 
+def test_settings_in_the_current_folder_that_numba_does_not_read(tmp_path, monkeypatch):
+    """Without PyYAML, which nothing of ours needs, and in a folder that is closed to us."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / ".numba_config.yaml").write_text("DISABLE_JIT: 1")
+    monkeypatch.setattr("usdbrdf.job.compiler.find_spec", lambda name: None, raising=False)
+    refuse_unusable_settings()
+    (tmp_path / ".numba_config.yaml").unlink()
+
+    def closed(self, **_):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr("pathlib.Path.stat", closed)
+    refuse_unusable_settings()
+
+
 @pytest.mark.parametrize("granted", [0, 1, 5, 6, 100])
 def test_three_cores_want_six_threads_which_are_gone_afterwards(monkeypatch, granted):
     start, started = threading.Thread.start, []

@@ -202,6 +202,25 @@ def test_both_variants_render_a_folder_of_views(
     assert (pictures[0] != pictures[1]).any()  # noise of its own in each view
 
 
+def test_views_are_of_the_frame_that_is_asked_for(room: Path, tmp_path: Path) -> None:
+    """An artist's edits may move: the lamp is gone at the second."""
+    root = room / "room.usda"
+    range_of_two = "startTimeCode = 1\nendTimeCode = 2\nupAxis"
+    root.write_text(root.read_text().replace("upAxis", range_of_two))
+    moving = 'token visibility.timeSamples = { 1: "inherited", 2: "invisible" }'
+    edits = f'over "room" {{\n over "geo" {{\n over "lamp" {{\n {moving}\n }}\n }}\n }}'
+    (room / "edits.usda").write_text(f"#usda 1.0\n{edits}\n")
+    views, named = _views(tmp_path, "a"), ["--samples", "16", "--denoise", "none"]
+    means = []
+    for number in ("1", "2"):
+        target = tmp_path / number
+        command = ["relight", str(room), "-o", str(target), "--views", str(views), *named]
+        assert main([*command, "--frame", number]) == 0
+        means.append(read_radiance(target / "a.exr").mean())
+    assert means[0] > 0.01
+    assert means[1] == 0
+
+
 def test_views_through_lenses_are_those_of_their_pinhole_frames(room: Path, tmp_path: Path) -> None:
     views = _views(tmp_path, "a")
     document = json.loads(views.read_text())
@@ -272,7 +291,6 @@ def _refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[
         (["--insert", "a.ply", "scale=1e30"], 2, "at most 1,000,000,000"),
         (["--exposure", "2"], 2, "--exposure: is of .png"),
         (["--format", "png"], 2, "--format png: is of the pictures of --views"),
-        (["--views", "v.json", "--frame", "1"], 2, "--views, --frame: they exclude"),
         (["--views", "v.json", "--camera", "/room/eye"], 2, "--views, --camera: they exclude"),
     ],
 )
@@ -303,6 +321,16 @@ def test_a_scene_takes_no_options_of_pictures(
     assert status == 2
     assert f"{option[0]}: is of pictures" in said
     assert not target.exists()
+
+
+def test_a_scene_has_the_cameras_of_the_views_or_one_of_the_stage(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["--views", str(_views(tmp_path, "a")), "--camera", "/room/eye"]
+    status, said = _refused([str(room), "-o", str(tmp_path / "scene.xml"), *asked], capsys)
+    assert status == 2
+    assert "--views, --camera: they exclude each other" in said
+    assert not (tmp_path / "scene.xml").exists()
 
 
 def test_two_views_of_one_name_are_refused(

@@ -222,12 +222,17 @@ def _no_modules_of_the_current_folder() -> Iterator[None]:
 
 
 def refuse_modules_of(folder: Path) -> None:
-    """EnvironmentFailure where Python would take a file or folder for a module of its own."""
+    """EnvironmentFailure where Python would take a file or folder for a module of its own. Those
+    that are built into it, such as time, nothing stands in for."""
+    own = sys.stdlib_module_names.difference(sys.builtin_module_names)
+    try:
+        entries = [entry for entry in folder.iterdir() if entry.name.partition(".")[0] in own]
+    except PermissionError:  # of a folder that cannot be listed Python imports nothing either
+        return
     found = sorted(
         entry.name
-        for entry in folder.iterdir()
-        if entry.name.partition(".")[0] in sys.stdlib_module_names
-        and (entry.suffix in (".py", ".pyc", ".so") or any(entry.glob("__init__.*")))
+        for entry in entries
+        if entry.suffix in (".py", ".pyc", ".so") or any(entry.glob("__init__.*"))
     )
     if found:
         raise EnvironmentFailure(

@@ -180,6 +180,12 @@ def write_plot(path: Path, rows: Sequence[Row]) -> None:
     Without matplotlib nothing is drawn, and one line says so. Its settings, of which it takes those
     in the current folder for the user's, play no part.
     """
+    unread = f"{path.name}: not drawn, matplotlib cannot read its settings, matplotlibrc"
+    # It would wait for a FIFO for ever; folders it passes over.
+    found = Path("matplotlibrc")
+    if os.path.exists(found) and not (os.path.isfile(found) or os.path.isdir(found)):
+        say(f"{unread} (no regular file).")
+        return
     try:
         from matplotlib import rc_context, rcdefaults
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -187,8 +193,8 @@ def write_plot(path: Path, rows: Sequence[Row]) -> None:
     except ImportError:
         say(f"{path.name}: not drawn, matplotlib is missing. Install usdbrdf[report].")
         return
-    except ValueError as error:
-        say(f"{path.name}: not drawn, matplotlib cannot read its settings, matplotlibrc ({error}).")
+    except (OSError, ValueError) as error:
+        say(f"{unread} ({error}).")
         return
     with rc_context():
         rcdefaults()

@@ -31,6 +31,10 @@ MAX_DEPTH = 64
 _MAX_ARRAY_BYTES = 4 << 30  # of one that is stored smaller
 _INTEGER_LIMIT = 1 << 63
 _HALF_A_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # or half of a whole one
+# What XML may say that it is written in, of what has a letter in each byte.
+_OF_ONE_BYTE = re.compile(
+    rb"<\?xml[^>]{1,99}?encoding=[\"'](iso-8859-(?:1[0134-6]?|[2-9])|windows-125[0-8])[\"']", re.I
+)
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[\[\]{},:]|[^\s\[\]{},:"]+', re.DOTALL)
 
 
@@ -108,8 +112,8 @@ def json_text(obj: Any) -> str:
 
 
 def read_text(path: Path) -> str:
-    """A whole file of UTF-8, or of UTF-16 with its mark, within ``MAX_BYTES``; InputRefused
-    otherwise."""
+    """A whole file of UTF-8, of UTF-16 with its mark, or of XML in what it says that it is in,
+    within ``MAX_BYTES``; InputRefused otherwise."""
     try:
         if not path.is_file():  # a FIFO or device would block or never end
             raise InputRefused(f"{path}: no such file, or not a regular one. [document.missing]")
@@ -129,6 +133,8 @@ def read_text(path: Path) -> str:
         ) from error
     except UnicodeDecodeError as error:
         encoding = "UTF-16, as its mark says" if error.encoding.startswith("utf-16") else "UTF-8"
+        if error.encoding == "charmap":
+            encoding = "of the encoding that its first line names"
         raise InputRefused(
             f"{path}: byte {error.start} is not {encoding}. Save the document as UTF-8. "
             "[document.json]"
@@ -136,9 +142,15 @@ def read_text(path: Path) -> str:
 
 
 def encoding_of_text(content: bytes) -> str:
-    """What the mark at its beginning says, which spreadsheets write; UTF-8 without one."""
-    marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return "utf-16" if marked else "utf-8-sig"
+    """What the mark at its beginning says, which spreadsheets write, or the first line of an XML
+    document; UTF-8 without any."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    for encoding in ("utf-16-le", "utf-16-be"):
+        if content.startswith("<?xml".encode(encoding)):
+            return encoding
+    declared = _OF_ONE_BYTE.match(content)
+    return declared[1].decode().lower() if declared else "utf-8-sig"
 
 
 def _parsed(text: str, number: Callable[[str], float]) -> Any:

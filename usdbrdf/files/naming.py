@@ -60,14 +60,15 @@ def readable_label(label: str) -> str:
 
 
 def meant_by(
-    wanted: PurePosixPath, stem: str, paths: Sequence[PurePosixPath]
+    wanted: PurePosixPath, stem: str, paths: Collection[PurePosixPath]
 ) -> list[PurePosixPath]:
     """Those of ``paths`` that a document means by ``wanted``, or by a file of any kind there that
     is called ``stem``: the path itself, else those that end with it, else, as it may come from
     another machine, those that it ends with."""
+    if wanted in paths:
+        return [wanted]
     any_kind = wanted.parent / stem
     searches: tuple[Callable[[PurePosixPath], bool], ...] = (
-        lambda p: p == wanted,
         lambda p: p.with_suffix("") == any_kind,
         lambda p: p.parts[-len(wanted.parts) :] == wanted.parts,
         lambda p: p.with_suffix("").parts[-len(any_kind.parts) :] == any_kind.parts,

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 
 from usdbrdf.errors import EnvironmentFailure
 
-# Which numba looks for in the current folder, and obeys.
+# Which numba looks for in the current folder, and obeys where PyYAML is there to read it.
 _SETTINGS = Path(".numba_config.yaml")
 
 
 def refuse_unusable_settings() -> None:
     """EnvironmentFailure where kernels would not be compiled, which then find nothing, or where
     numba does not start."""
-    if _SETTINGS.is_file():  # a capture by others may bring one along
+    # A capture by others may bring one along. Not Path.is_file: a folder may be closed to us.
+    if os.path.isfile(_SETTINGS) and find_spec("yaml") is not None:
         raise EnvironmentFailure(
             f"{_SETTINGS.absolute()}: numba, which compiles our code, would take settings from "
             "this file. Run the same command in another folder, or delete it. "

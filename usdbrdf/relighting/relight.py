@@ -158,6 +158,8 @@ def _check(options: RelightOptions, output: Path, asset: Asset) -> None:
             f"{output}: pictures are written as {', '.join((*LINEAR, *DISPLAYED))}, scenes for "
             f"Mitsuba as {SUFFIX}. Choose one of these extensions. [relight.format]"
         )
+    if many and options.camera is not None:
+        raise UsageError("--views, --camera: they exclude each other. [usage.option]")
     if suffix == SUFFIX:
         _refuse_options_of_pictures(options)
     else:
@@ -207,9 +209,6 @@ def _refuse_options_of_pictures(options: RelightOptions) -> None:
 def _refuse_what_has_no_effect(options: RelightOptions, suffix: str) -> None:
     """UsageError for options of other pictures than those that are asked for."""
     many = options.views is not None
-    for name in ("camera", "frame"):
-        if many and getattr(options, name) is not None:
-            raise UsageError(f"--views, --{name}: they exclude each other. [usage.option]")
     if not many and options.format != RelightOptions().format:
         raise UsageError(
             f"--format {options.format}: is of the pictures of --views; without them the ending "

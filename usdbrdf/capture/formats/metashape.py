@@ -33,7 +33,14 @@ from usdbrdf.capture.formats.named_pictures import (
 )
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.tables import Element, beginning_of, files_of, number_in, numbers_of, read_xml
+from usdbrdf.files.tables import (
+    Element,
+    beginning_of_text,
+    files_of,
+    number_in,
+    numbers_of,
+    read_xml,
+)
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
@@ -56,8 +63,8 @@ def matches(path: Path) -> bool:
 
 
 def _documents(path: Path) -> list[Path]:
-    heads = ((file, beginning_of(file)) for file in files_of(path, [".xml"]))
-    return [file for file, head in heads if b"<chunk" in head and b"<sensors" in head]
+    heads = ((file, beginning_of_text(file)) for file in files_of(path, [".xml"]))
+    return [file for file, head in heads if "<chunk" in head and "<sensors" in head]
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:

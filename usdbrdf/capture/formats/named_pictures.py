@@ -43,13 +43,13 @@ SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
 # What cameras write and nothing here reads: documents name it, and what was made of it is there.
 _HEIF = frozenset((".heic", ".heif", ".hif"))
 _OF_CAMERAS = RAW_SUFFIXES | _HEIF
-# Poses are found of these, and their radiance, beside them, is taken instead. PNG has its depths or
-# normals there more often.
+# Poses are found of these, and radiance beside them is taken instead; PNG has depths more often.
 _PHOTOGRAPHS, _RADIANCE = frozenset((".jpg", ".jpeg")) | _OF_CAMERAS, (".exr", ".hdr")
 # Where programs put the pictures, beside what they say of them.
 FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
 # Of documents that name pictures where they lay on another machine.
 _OTHER_FOLDER = "Name the folder of the pictures with --frames, or name them relative to this one"
+_LETTERS: tuple[Callable[[str], str], ...] = (str, str.lower)  # in which names are compared
 _MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
 _UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
@@ -92,20 +92,18 @@ class Pictures:
         in these letters, else in others, else by its name alone, with its suffix or another; of a
         photograph with radiance beside it that; None where there is none or several."""
         written = PurePosixPath(_composed(label).replace("\\", "/").lstrip("./"))
-        names = _names_without_suffix(written.name)
-        stem = next((name for name in names if name.lower() in self._by_stem), None)
-        if stem is None:
+        known = (n for n in _names_without_suffix(written.name) if n.lower() in self._by_stem)
+        if (stem := next(known, None)) is None:
             return None
         candidates = self._by_stem[stem.lower()]
         found: list[Path] = []
-        for change in (str, str.lower):
-            path_of = {PurePosixPath(change(str(p))): path for path, p in candidates}
+        for change, path_of in zip(_LETTERS, self._paths_of[stem.lower()], strict=True):
             # Of paths that differ in case alone nobody knows which is meant.
             if not found and len(path_of) == len(candidates):
                 wanted = PurePosixPath(change(str(written)))
-                found = [path_of[p] for p in meant_by(wanted, change(stem), list(path_of))]
-        exact = [path for path, p in candidates if p.stem == stem]
-        path = nearest_to_radiance(found or exact or [path for path, _ in candidates])
+                found = [path_of[p] for p in meant_by(wanted, change(stem), path_of)]
+        found = found or [path for path, p in candidates if p.stem == stem]
+        path = nearest_to_radiance(found or [path for path, _ in candidates])
         return path and _or_radiance(path, [p for p, _ in candidates], self.instead)
 
     def of_each_name(self) -> tuple[Path, ...]:
@@ -128,8 +126,8 @@ class Pictures:
     def mask_of(self, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
         """``mask_beside`` of a picture, or of another of its name beside it, by its path below the
         pictures' folder, else by its name alone, where no other folder has a picture of it."""
-        candidates = self._by_stem[_composed(picture.stem).lower()]
-        alike = [path for path, p in candidates if p.stem == _composed(picture.stem)]
+        stem = _composed(picture.stem)
+        alike = [path for path, p in self._by_stem[stem.lower()] if p.stem == stem]
         beside = [path for path in alike if path.parent == picture.parent]
         names = [path.relative_to(self.folder).as_posix() for path in beside]
         if len(beside) == len(alike):
@@ -144,6 +142,14 @@ class Pictures:
             relative = PurePosixPath(_composed(path.relative_to(self.folder).as_posix()))
             by_stem.setdefault(relative.stem.lower(), []).append((path, relative))
         return by_stem
+
+    @cached_property
+    def _paths_of(self) -> dict[str, list[dict[PurePosixPath, Path]]]:
+        """The same by their paths in ``_LETTERS``: many folders may have pictures of one name."""
+        return {
+            stem: [{PurePosixPath(to(str(p))): path for path, p in alike} for to in _LETTERS]
+            for stem, alike in self._by_stem.items()
+        }
 
     def numbered(self) -> dict[int, Path]:
         """The pictures by the number at the end of their names, those without left out; of two of

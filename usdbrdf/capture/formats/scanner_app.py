@@ -37,6 +37,8 @@ DESCRIPTION = DESCRIPTIONS[NAME]
 # The app's own names, the one with the whole surface first.
 _MESHES = ("export.obj", "textured_output.obj", "export.ply", "export_refined.obj")
 _FRAME = re.compile(r"frame_\d+\.json")
+# The app's own suffix first; the others are what it is copied or converted to.
+_PHOTOGRAPHS = (".jpg", ".JPG", ".jpeg", ".JPEG", ".png", ".PNG")
 
 
 def matches(path: Path) -> bool:
@@ -72,8 +74,12 @@ def _records(folder: Path, options: CaptureOptions, findings: Findings) -> list[
     documents = sorted(p for p in folder.glob("frame_*.json") if _FRAME.fullmatch(p.name))
     records = []
     for document in documents:
-        photograph = path_in_capture(folder, document.with_suffix(".jpg").name, options)
-        if not photograph.is_file():
+        beside = (
+            path_in_capture(folder, document.with_suffix(suffix).name, options)
+            for suffix in _PHOTOGRAPHS
+        )
+        photograph = next((path for path in beside if path.is_file()), None)
+        if photograph is None:
             findings.count("poses_without_photograph", 1)
             continue
         pose = read_json(document, nonfinite_below=("cameraPoseARFrame",))
