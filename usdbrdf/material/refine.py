@@ -172,7 +172,7 @@ def _reflection(lighting: Lighting, told: _Told, irradiance: Float) -> Reflectio
         radiance=told.in_own_light,
         irradiance=irradiance,
         error=told.error,
-        known=before.coverage.observed | before.coverage.glimpsed,
+        known=before.coverage.shown,
         emissive=before.emissive,
         bound=np.where(before.coverage.clipped, before.lit.min(axis=1), 0),
     )

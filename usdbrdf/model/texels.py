@@ -76,6 +76,11 @@ class CoverageMap:
         return np.asarray(self.kind >= Coverage.CLIPPED, np.bool_)
 
     @property
+    def shown(self) -> Bool:
+        """(T,): a frame shows the texel, alone or with something else."""
+        return np.asarray(self.kind != Coverage.FILLED, np.bool_)
+
+    @property
     def glimpsed(self) -> Bool:
         """(T,): frames show the texel in pixels that show something else as well."""
         return np.asarray(self.kind == Coverage.GLIMPSED, np.bool_)

@@ -35,7 +35,7 @@ from usdbrdf.shading.clipped_emitters import (
     nothing_known,
 )
 from usdbrdf.shading.gloss import mirrored_to_frames
-from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
+from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden, said_to_shine
 from usdbrdf.shading.lamp_light import Lamps, looked_at_closely
 from usdbrdf.shading.outside_light import Asked
 from usdbrdf.transport.environment import Environment, black_environment
@@ -380,8 +380,7 @@ def _reflecting(
     said: Mapping[int, bool],
 ) -> Float:
     """``lit`` (T, 3) with what those of the groups (K,) that are walls reflect."""
-    owner = surface.texels.object_index()
-    told = np.isin(owner, [number for number, is_lamp in said.items() if is_lamp])
+    told = said_to_shine(surface.texels, said)
     lamps = KnownLamps(told | groups.texels_of(groups.lamp), said)
     light = light_of_hidden(surface, lit, coverage, environment, seed, lamps)
     return np.where(groups.texels_of(wall)[:, None], light, lit)
@@ -475,20 +474,19 @@ def _evidence(
 ) -> Evidence:
     texels = surface.texels
 
-    lamps = []
-    for k in range(len(groups)):
+    lamps = np.zeros((len(groups), len(chosen), 3), np.float32)
+    for k in np.unique(groups.group[groups.group >= 0]):
         alone = np.where((groups.group == k)[:, None], groups.bound[k], np.float32(0))
         light = Shining.of(surface, np.repeat(alone, 3, axis=1).astype(np.float32))
-        lamps.append(
-            irradiance_of_texels(surface, light, black_environment(), chosen, seed + k + 1)
-        )
-    dark = np.where(groups.group[:, None] >= 0, np.float32(0), lit)
+        dark, own_seed = black_environment(), seed + int(k) + 1
+        lamps[k] = irradiance_of_texels(surface, light, dark, chosen, own_seed)
+    rest = np.where(groups.group[:, None] >= 0, np.float32(0), lit)
     return Evidence(
         radiance=lit[chosen],
         irradiance=irradiance_of_texels(
-            surface, Shining.of(surface, dark, environment), environment, chosen, seed
+            surface, Shining.of(surface, rest, environment), environment, chosen, seed
         ),
-        lamp_irradiance=np.stack(lamps),
+        lamp_irradiance=lamps,
         position=texels.position[chosen] / (_UNIT * np.sqrt(texels.area.sum())),
         segment=segment,
         object=texels.object_index()[chosen].astype(np.int32),

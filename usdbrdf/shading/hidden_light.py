@@ -60,6 +60,12 @@ class KnownLamps(NamedTuple):
         return cls(clipped, {}, _AS_A_WHOLE)
 
 
+def said_to_shine(texels: Texels, said: Mapping[int, bool]) -> Bool:
+    """(T,): the texels of those objects of which a person says that they are lamps."""
+    lamps = [number for number, is_lamp in said.items() if is_lamp]
+    return np.asarray(np.isin(texels.object_index(), lamps), np.bool_)
+
+
 def with_hidden_light(
     run: TaskRun,
     name: str,
@@ -73,8 +79,7 @@ def with_hidden_light(
 ) -> Float:
     """``light_of_hidden`` from ``lit`` (T, 3), what is known of it, on; ``filled`` (T, 3) is L_d as
     texturing left it. What this changes is kept under ``name``."""
-    shown = coverage.observed | coverage.glimpsed | lamps.texel
-    lamplit = np.where(shown[:, None], lit, filled)
+    lamplit = np.where((coverage.shown | lamps.texel)[:, None], lit, filled)
 
     def compute() -> dict[str, Array]:
         light = light_of_hidden(surface, lamplit, coverage, environment, seed, lamps, lit)

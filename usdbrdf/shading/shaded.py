@@ -23,7 +23,7 @@ from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.base_color import albedo_map, clear_of
 from usdbrdf.shading.clipped_light import ClippedLight, clipped_groups, estimate_clipped_light
-from usdbrdf.shading.hidden_light import KnownLamps, with_hidden_light
+from usdbrdf.shading.hidden_light import KnownLamps, said_to_shine, with_hidden_light
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.unseen_lamps import UnseenLamps, estimate_unseen_lamps
 from usdbrdf.texturing.inpaint import telling
@@ -349,7 +349,7 @@ def _light(
     texels, filled, doubt = surface.texels, lit, outside.doubt if outside else 0.0
     owner = texels.object_index()
     groups = clipped_groups(texels, lit, coverage, said)
-    told = np.isin(owner, [number for number, is_lamp in said.items() if is_lamp])
+    told = said_to_shine(texels, said)
     # What clips may be a lamp, or reflect what is not known yet.
     may_shine = told | coverage.clipped | groups.texels_of(groups.lamp)
     # In the light of what it may be that no frame shows.
