@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import socket
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -79,7 +83,7 @@ def test_what_does_not_pass_is_a_sentence_with_the_address(
     address, name = _kept(server, tmp_path, monkeypatch)
     badly = Badly(1 << 30, how)
     if how == "busy":  # of which the library is told, and tries for long
-        monkeypatch.setattr(object_store, "_LONGEST_READ", 0.0)
+        monkeypatch.setattr(object_store, "_LONGEST_TRY", 0.0)
     with disturbed(server, badly) as between:
         let_us_in(between, monkeypatch)
         theirs = Store(files_at(address, tmp_path / "theirs"))
@@ -88,5 +92,71 @@ def test_what_does_not_pass_is_a_sentence_with_the_address(
     assert str(found.value).startswith(f"{address}")
     assert str(found.value).endswith("[cluster.objects]")
     assert "\n" not in str(found.value)
-    assert 4 <= badly.asked <= 30
+    assert (3 if how == "busy" else 4) <= badly.asked <= 30
     assert not [*theirs.files.folder.iterdir()]
+
+
+@pytest.fixture
+def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[socket.socket]]:
+    """Who connected to a store that takes every request and never answers."""
+    s3fs = pytest.importorskip("s3fs", reason="s3fs is not installed")
+    s3fs.S3FileSystem.clear_instance_cache()
+    taken: list[socket.socket] = []
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def take() -> None:
+            with suppress(OSError):
+                while True:
+                    taken.append(listening.accept()[0])
+
+        Thread(target=take, daemon=True).start()
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{listening.getsockname()[1]}")
+        for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+            monkeypatch.setenv(name, "test")
+        monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        yield taken
+        listening.shutdown(socket.SHUT_RDWR)
+    for each in taken:
+        each.close()
+
+
+@pytest.mark.parametrize("what", ["upload", "download"])
+def test_a_store_that_never_answers_is_asked_three_times(
+    silent: list[socket.socket], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    from fsspec.config import conf
+
+    # A user's own setting, by which this takes no minute; what it stands for without is below.
+    monkeypatch.setitem(conf, "s3", {"config_kwargs": {"read_timeout": 0.2}})
+    monkeypatch.setattr(object_store, "_LONGEST_TRY", 0.4)
+    address = f"s3://{BUCKET}/prefix"
+    store = Store(files_at(address, tmp_path / "ours"))
+
+    def use() -> None:
+        if what == "upload":
+            store.keep(ARRAY)
+            store.files.settle()
+        else:
+            store.array(f"{'0' * 64}.npy")
+
+    begun = time.monotonic()
+    with pytest.raises(EnvironmentFailure, match="the object store failed") as found:
+        use()
+    assert time.monotonic() - begun < 15
+    assert len(silent) == 3
+    assert str(found.value).startswith(address)
+    assert "\n" not in str(found.value)
+    assert not [*tmp_path.rglob("*.npy")]
+
+
+def test_a_store_that_never_answers_is_said_within_a_minute(tmp_path: Path) -> None:
+    pytest.importorskip("s3fs", reason="s3fs is not installed")
+    files = files_at(f"s3://{BUCKET}/prefix", tmp_path)
+    assert isinstance(files, object_store.Objects)
+    system, asked = files._system, files._system.config_kwargs
+    tries = asked["retries"]["total_max_attempts"]
+    between = sum(2.0**i for i in range(tries - 1))  # botocore's longest waits
+    once = tries * (asked["connect_timeout"] + asked["read_timeout"]) + between
+    assert system.retries * once <= 63
+    # Two such waits are never put one after the other.
+    assert tries * asked["read_timeout"] > object_store._LONGEST_TRY

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from dataclasses import replace
 
@@ -189,3 +190,19 @@ def test_a_review_that_is_no_layer_is_named(built, content):
     with pytest.raises(InputRefused, match=r"review\.usda.*\[review\.layer\]$"):
         read_review(built.asset)
     assert changes_since(built.asset) == {}
+
+
+@pytest.mark.fault("I13")
+@pytest.mark.parametrize("what", ["folder", "pipe", "link that leads nowhere"])
+def test_what_is_in_the_place_of_a_review_is_named_and_not_taken_for_none(built, what):
+    file = review_file(built.asset)
+    file.unlink(missing_ok=True)
+    if what == "folder":
+        file.mkdir()
+    elif what == "pipe":
+        os.mkfifo(file)
+    else:
+        file.symlink_to("gone/review.usda")
+    with pytest.raises(InputRefused, match=r"review\.usda: this is no regular file.*\[review"):
+        read_review(built.asset)
+    file.rmdir() if what == "folder" else file.unlink()

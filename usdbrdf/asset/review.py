@@ -7,6 +7,7 @@ looks the same. Nobody but a person changes it, through the page or by hand."""
 from __future__ import annotations
 
 import math
+import os
 import re
 import sys
 import unicodedata
@@ -108,8 +109,14 @@ def read_review(asset: Asset) -> dict[str, Judgement]:
     """By prim path; empty where nobody has said anything. InputRefused where the layer is no USD
     or says something of another kind; what it says is checked by ``Judgement.fault`` alone."""
     file = review_file(asset)
-    if not file.is_file():
+    if not os.path.lexists(file):
         return {}
+    if not file.is_file():
+        raise InputRefused(
+            f"{file}: this is no regular file, or leads to none, and what people said of the "
+            "objects is to be in it. Put the layer there, from a copy of the asset, or remove it. "
+            "[review.layer]"
+        )
     layer = None
     with suppress(Tf.ErrorException):
         layer = Sdf.Layer.OpenAsAnonymous(str(file)) if _is_plain(file) else None

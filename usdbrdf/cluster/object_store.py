@@ -30,9 +30,15 @@ from usdbrdf.job.progress import say
 T = TypeVar("T")
 # Uploads at a time, and those that wait, for which arrays stay in memory.
 _AT_ONCE, _WAITING = 8, 32
-# Seconds between tries to read an object, of which a part came, or something else: libraries try
-# again where they are told of an error alone. After the latter they have tried for long enough.
-_BETWEEN_READS, _LONGEST_READ = (0.2, 1.0, 3.0), 60.0
+# Seconds between tries of what passes: an object of which a part came, or something else, or a
+# store that is busy. Whoever was let wait for so long has been tried for long enough.
+_BETWEEN_TRIES, _LONGEST_TRY = (0.2, 1.0, 3.0), 30.0
+# How a client of S3 waits: 15 s for each of three answers, and a few between. Left alone, its two
+# libraries try again one inside the other, 25 times.
+_PATIENCE: dict[str, Any] = {
+    "connect_timeout": 5, "read_timeout": 15,
+    "retries": {"mode": "standard", "total_max_attempts": 3},
+}  # fmt: skip
 _NOTE = "prefix.txt"
 
 
@@ -80,7 +86,7 @@ class Objects(Files):
             raise self._failed(error) from error
 
     def _upload(self, path: Path, name: str) -> None:
-        self._asked(lambda: self._system.put_file(str(path), self._at(name)))
+        _tried(lambda: self._asked(lambda: self._system.put_file(str(path), self._at(name))))
 
     def settle(self) -> None:
         uploads, pool = [*self._uploads], self._pool
@@ -100,16 +106,8 @@ class Objects(Files):
         if to.is_file() and sha256_of(to) == name[:DIGITS]:
             return to
         to.parent.mkdir(parents=True, exist_ok=True)
-        begun, waits = time.monotonic(), iter(_BETWEEN_READS)
-        while True:
-            try:
-                self._copy(name, to)
-                return to
-            except _Passing:
-                wait = next(waits, None)
-                if wait is None or time.monotonic() - begun > _LONGEST_READ:
-                    raise
-                time.sleep(wait)
+        _tried(lambda: self._copy(name, to))
+        return to
 
     def _copy(self, name: str, to: Path) -> None:
         with temporary_beside(to) as staged:
@@ -231,6 +229,19 @@ class _Passing(EnvironmentFailure):
     """What another try may not meet again."""
 
 
+def _tried(call: Callable[[], None]) -> None:
+    """Do it, again where that may help; a store that was waited for is not asked again."""
+    begun, waits = time.monotonic(), iter(_BETWEEN_TRIES)
+    while True:
+        try:
+            return call()
+        except _Passing:
+            wait = next(waits, None)
+            if wait is None or time.monotonic() - begun > _LONGEST_TRY:
+                raise
+            time.sleep(wait)
+
+
 def files_at(address: str | Path, copies: Path) -> Files:
     """Those of a folder or an object store; ``copies`` is where those of the latter go. Raises as
     ``refuse_unknown`` for a store that nothing here can talk to."""
@@ -305,11 +316,17 @@ def _file_system(address: str) -> tuple[Any, str]:
     kind = address.partition("://")[0]
     refuse_unknown(address)
     try:
+        from fsspec.config import conf
         from fsspec.core import url_to_fs
 
-        # Folders are made where there are such.
-        more = {"auto_mkdir": True} if kind in ("file", "local") else {}
+        more: dict[str, Any] = {}
+        if kind in ("file", "local"):  # folders are made where there are such
+            more["auto_mkdir"] = True
+        if kind in ("s3", "s3a"):  # a user's own settings of fsspec count before ours
+            more["config_kwargs"] = _PATIENCE | conf.get(kind, {}).get("config_kwargs", {})
         system, prefix = url_to_fs(address, use_listings_cache=False, **more)
+        if kind in ("s3", "s3a"):
+            system.retries = 1  # the client within tries again
     except Exception as error:  # of those that ask their store at once, of every library its own
         raise EnvironmentFailure(
             f"--shared-folder {address}: the object store does not answer "
