@@ -228,6 +228,7 @@ def test_photographs_have_the_space_of_the_profile_in_them(capture, profile, enc
         ("Display P3 with sRGB TRC", None),
         ("srgb_p3d65_scene", "srgb_p3d65_scene"),  # of OpenColorIO
         ("srgb_ap1_scene", "srgb_ap1_scene"),
+        ("sP3", "srgb_p3d65_scene"),  # of Blender
         ("sRGB-elle-V2-g10.icc", None),
         ("Adobe RGB (1998)", "g22_adobergb_scene"),
         ("Compatible with Adobe RGB (1998)", "g22_adobergb_scene"),

@@ -101,6 +101,18 @@ def _other_lens(capture):
         document["KRT"][3]["distortionModel"] = "Pinhole"
 
 
+def _more_terms(capture):
+    """A fisheye of six radial terms and two tangential ones, as Project Aria has it."""
+    with edited(capture / "cameras.json") as document:
+        terms = [-0.02, 0.004, -0.001, 0.0, 0.002, 0.0, 0.003, -0.002]
+        document["KRT"][3] |= {"distortionModel": "Fisheye", "distortion": terms}
+
+
+def _sixth_term(capture):
+    with edited(capture / "cameras.json") as document:
+        document["KRT"][3]["distortion"] = [0.0] * 5 + [0.1]
+
+
 def _other_names(capture):
     with edited(capture / "cameras.json") as document:
         for row in document["KRT"]:
@@ -117,6 +129,8 @@ def _no_list(capture):
         (_no_mesh, r"no mesh\. Download mesh.obj.*--mesh\. \[mesh.missing\]"),
         (_no_pictures, r"no pictures below.*\[capture.frames\]"),
         (_other_lens, r"the lens of '1/1_REN0003' is 'Pinhole'.*\[capture.camera\]"),
+        (_more_terms, r"the lens of '1/1_REN0003' has more terms than its model Fisheye"),
+        (_sixth_term, r"has more terms than its model RadialAndTangential.*\[capture.camera\]"),
         (_other_names, r"none of its 11 cameras has a picture in images-2k.*\[capture.frames\]"),
         (_no_list, r"no list \"KRT\".*\[capture.format\]"),
     ],

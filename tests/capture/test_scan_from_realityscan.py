@@ -10,7 +10,7 @@ from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image, w
 from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import pictures_of
-from usdbrdf.capture.formats.realityscan import records_of_table
+from usdbrdf.capture.formats.realityscan import records_of_sidecars, records_of_table
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
 
@@ -214,21 +214,63 @@ def write_sidecars(folder, room, *, as_attributes):
     return folder
 
 
-@pytest.mark.parametrize(
-    "bent", ["", "0", "0 0 0 0 0 0", "-0.1 0 0 0 0 0", "-0.1", "-0,1 0 0 0 0 0"]
-)
+def _with_lens(folder, model, terms):
+    for file in folder.rglob("*.xmp"):
+        text = file.read_text().replace("brown3", model)
+        file.write_text(text.replace(">0 0 0 0 0 0<", f">{terms}<"))
+    return folder
+
+
+@pytest.mark.parametrize("bent", ["", "0", "0 0 0 0 0 0"])
 def test_a_division_without_terms_is_a_pinhole(tmp_path, room, bent):
     """As those write it who cut panoramas into pictures."""
     folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)
-    write_obj(folder / "model.obj", room)
-    for file in folder.rglob("*.xmp"):
-        text = file.read_text().replace("brown3", "division")
-        file.write_text(text.replace(">0 0 0 0 0 0<", f">{bent}<"))
-    if "1" in bent:
-        with pytest.raises(InputRefused, match=r"the lens model 'division' is not read"):
-            read_scan(folder, OPTIONS)
-    else:
-        assert_same(read_scan(folder, OPTIONS), room)
+    scan = read_scan(_with_lens(folder, "division", bent), OPTIONS)
+    assert_same(scan, room)
+    assert not any("Division" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize("bent", ["-0.1 0 0 0 0 0", "-0.1"])
+def test_a_division_straightens_by_its_term(tmp_path, room, bent):
+    """A pixel at the radius r off the axis shows what a pinhole shows at r / (1 + k1 r^2)."""
+    folder = _with_lens(
+        write_sidecars(tmp_path / "scan", room, as_attributes=False), "division", bent
+    )
+    said = f"the lens model of {len(room.images)} cameras is Division"
+    assert any(said in warning for warning in read_scan(folder, OPTIONS).warnings)
+    records = _records_of(folder)
+    fx, fy, cx, cy = room.intrinsics[0]
+    pixels = np.random.default_rng(0).uniform((0, 0), (WIDTH, HEIGHT), (50, 2))
+    bent_plane = (pixels - (cx, cy)) / (fx, fy)
+    straight = bent_plane / (1 - 0.1 * (bent_plane**2).sum(axis=1, keepdims=True))
+    rays = np.column_stack([straight[:, 0], -straight[:, 1], -np.ones(50)])
+    seen = records[0].lens.project(rays, records[0].intrinsics)
+    np.testing.assert_allclose(seen, pixels, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("model", "terms"),
+    [("division", "-0.1 0.02 0 0 0 0"), ("division", "-0,1 0 0"), ("brown3", "-0,1 0 0 0 0 0"),
+     ("brown3", "0 0 0 0 0 0 0.1"), ("brown3", "nan 0 0"), ("fisheye", "0.1 0 0")],
+)  # fmt: skip
+def test_terms_that_nobody_knows_are_refused(tmp_path, room, model, terms):
+    folder = _with_lens(write_sidecars(tmp_path / "scan", room, as_attributes=False), model, terms)
+    with pytest.raises(InputRefused, match=rf"lens model '{model}' is not read with the terms"):
+        read_scan(folder, OPTIONS)
+
+
+def test_terms_of_zero_may_be_left_out(tmp_path, room):
+    """Scripts that write XMP state as many as brown3 has."""
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)
+    _with_lens(folder, "brown3", "-0.1 0.06 -0.01")
+    assert [record.lens.radial for record in _records_of(folder)] == [
+        (-0.1, 0.06, -0.01, 0.0)
+    ] * len(room.images)
+
+
+def _records_of(folder):
+    files = sorted(folder.rglob("*.xmp"))
+    return list(records_of_sidecars(files, pictures_of(folder, OPTIONS), Findings()))
 
 
 def test_the_model_none_is_a_pinhole_whatever_terms_stand_there(tmp_path, room):

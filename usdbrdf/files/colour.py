@@ -55,6 +55,7 @@ _PROFILES = {
     "c2": "srgb_rec709_scene",
     "c2ci": "srgb_rec709_scene",
     "display p3": "srgb_p3d65_scene",
+    "sp3": "srgb_p3d65_scene",
     "sp3c": "srgb_p3d65_scene",
 }
 _LINEAR_OF = {"srgb_p3d65_scene": "lin_p3d65_scene", "g22_adobergb_scene": "lin_adobergb_scene"}

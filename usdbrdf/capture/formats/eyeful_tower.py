@@ -116,7 +116,14 @@ def _matrix(row: dict[str, Any], key: str, size: int) -> Double | None:
 def _lens(row: dict[str, Any], name: str, source: Path) -> Lens:
     model, terms = row.get("distortionModel"), row.get("distortion") or []
     sound = isinstance(terms, list) and all(type(term) in (int, float) for term in terms)
-    terms = [*map(float, terms), *[0.0] * 8][:8] if sound else []
+    terms = [*map(float, terms), *[0.0] * (8 - len(terms))] if sound else []
+    # Those between, of which the authors' converter reads none, are 0 in what they publish.
+    unknown = {"RadialAndTangential": terms[5:], "Fisheye": terms[4:6] + terms[8:]}
+    if any(unknown.get(str(model), ())):
+        raise InputRefused(
+            f"{source}: the lens of {name!r} has more terms than its model {model} is known to "
+            "have. Undistort the pictures, and bring them with a transforms.json. [capture.camera]"
+        )
     if terms and model == "RadialAndTangential":
         k1, k2, p1, p2, k3, *_ = terms
         lens = Lens(radial=(k1, k2, k3), tangential=(p1, p2))

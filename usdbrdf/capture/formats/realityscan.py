@@ -150,12 +150,13 @@ def records_of_table(source: Path, pictures: Pictures, findings: Findings) -> It
         pose = rigid_pose(_axes(*(float(a or 0) for a in angles)), np.array(place, np.float64))
         centre = [number_in(row, *names) or 0.0 for names in (("px", "px_norm"), ("py", "py_norm"))]
         terms = [number_in(row, term) or 0.0 for term in ("k1", "k2", "k3", "k4", "t1", "t2")]
-        yield from _record(name, pictures.named(name), pose, focal, centre, terms, findings)
+        lens = _brown(terms)
+        yield from _record(name, pictures.named(name), pose, focal, centre, lens, findings)
 
 
 def _warn_of_division(records: Sequence[FrameRecord], findings: Findings, source: Path) -> None:
     """One sentence where lenses have k1 alone. The table does not name their model, and only
-    Division has no further term; its k1 bends the other way than Brown's."""
+    Division has no further term; its k1 is not Brown's, although both bend alike near the axis."""
     alone = [
         r for r in records if r.lens.bends and not any((*r.lens.radial[1:], *r.lens.tangential))
     ]
@@ -181,20 +182,18 @@ def records_of_sidecars(
     files: list[Path], pictures: Pictures, findings: Findings
 ) -> Iterator[FrameRecord]:
     """The cameras of XMP files, each beside its picture or of its name."""
-    all_files = set(files)
+    all_files, divided = set(files), 0
     for file in files:
         name, image = _name_and_picture(file, all_files, pictures)
         said = _sidecar_values(read_xml(file))
         rotation, place = _numbers(said, "Rotation", 9), _numbers(said, "Position", 3)
         focal = number_in(said, "FocalLength35mm")
-        model, terms = said.get("DistortionModel", "perspective"), _terms(said)
-        if not (model in _NO_TERMS or model.startswith("brown")) and (
-            # Of the usual model without terms it is a pinhole.
-            model != "division" or not _is_without_terms(said)
-        ):
+        lens = _lens(said)
+        if lens is None:
+            model, terms = said.get("DistortionModel"), said.get("DistortionCoeficients", "")
             raise InputRefused(
-                f"{file}: the lens model {model!r} is not read. Choose Brown in the alignment's "
-                "settings, and export again. [capture.camera]"
+                f"{file}: the lens model {model!r} is not read with the terms {terms[:60]!r}. "
+                "Choose Brown in the alignment's settings, and export again. [capture.camera]"
             )
         if abs(number_in(said, "Skew") or 0.0) > _NO_SKEW:
             raise InputRefused(
@@ -213,9 +212,16 @@ def records_of_sidecars(
             continue
         centre = [number_in(said, f"PrincipalPoint{axis}") or 0.0 for axis in "UV"]
         pose = opengl_from_opencv(rigid_pose(rotation.reshape(3, 3).T, place))
-        bent = terms if model not in _NO_TERMS else [0.0] * 6
+        divided += lens.curve == "division" and lens.bends
         squeeze = number_in(said, "AspectRatio") or 1.0
-        yield from _record(name, image, pose, focal, centre, bent, findings, squeeze)
+        yield from _record(name, image, pose, focal, centre, lens, findings, squeeze)
+    if divided:
+        findings.warn(
+            f"{files[0].parent.name}: the lens model of {divided} cameras is Division, whose "
+            "equation is not published; taken is Fitzgibbon's, r / (1 + k1 r^2). If the frames do "
+            "not agree, choose Brown3 in the alignment's settings, and export again. "
+            "[capture.camera]"
+        )
 
 
 def _name_and_picture(
@@ -241,17 +247,22 @@ def _sidecar_values(root: Element) -> dict[str, str]:
     return values
 
 
-def _is_without_terms(said: Mapping[str, str]) -> bool:
-    """Whether none is stated, however many of 0 are; False where nobody knows."""
+def _lens(said: Mapping[str, str]) -> Lens | None:
+    """Of the model that an XMP names; None of one that is not read."""
+    model = said.get("DistortionModel", "perspective")
+    if model in _NO_TERMS:
+        return PINHOLE
+    words = said.get("DistortionCoeficients", "").split()
     try:
-        return not np.array(said.get("DistortionCoeficients", "").split(), np.float64).any()
+        k1, *more = [float(word) for word in words] + [0.0] * (6 - len(words))
     except ValueError:
-        return False
-
-
-def _terms(said: Mapping[str, str]) -> list[float]:
-    found = _numbers(said, "DistortionCoeficients", 6)
-    return [0.0] * 6 if found is None else [float(number) for number in found]
+        return None
+    if not np.isfinite([k1, *more]).all() or len(more) > 5:
+        return None
+    if model.startswith("brown"):
+        return _brown([k1, *more])
+    known = model == "division" and not any(more)
+    return Lens(curve="division", shape=(k1,)) if known else None
 
 
 def _numbers(said: Mapping[str, str], key: str, count: int) -> Double | None:
@@ -262,17 +273,23 @@ def _numbers(said: Mapping[str, str], key: str, count: int) -> Double | None:
     return values if len(values) == count and np.isfinite(values).all() else None
 
 
+def _brown(terms: Sequence[float]) -> Lens:
+    """Of k1 to k4, t1, t2."""
+    # Its own template for OpenCV writes k1, k2, t2, t1: the other way round.
+    return Lens(radial=tuple(terms[:4]), tangential=(terms[5], terms[4]))
+
+
 def _record(
     name: str,
     image: Path | None,
     pose: Double,
     focal: float,
     centre: list[float],
-    terms: list[float],
+    lens: Lens,
     findings: Findings,
     squeeze: float = 1.0,
 ) -> Iterator[FrameRecord]:
-    """terms: k1 to k4, t1, t2; squeeze: the vertical focal length over the horizontal one."""
+    """squeeze: the vertical focal length over the horizontal one."""
     if image is None:
         drop_without_picture(name, findings)
         return
@@ -282,8 +299,6 @@ def _record(
         findings.drop(name, clause_of(error, image), "capture.image")
         return
     longer = max(width, height)
-    # Its own template for OpenCV writes k1, k2, t2, t1: the other way round.
-    lens = Lens(radial=tuple(terms[:4]), tangential=(terms[5], terms[4]))
     yield FrameRecord(
         name=name,
         image_path=image,
