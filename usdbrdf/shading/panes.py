@@ -1,16 +1,15 @@
-"""Panes: things that show what lies behind them.
+"""Panes: things through which one sees out of the scan.
 
 What a surface sends to a camera is fixed on the surface, but for what it mirrors. What a pane shows
-is fixed behind it: as the camera moves, the parallax of that moves over the pane. Of pixels that
-show the same place of a thing in several frames, the logarithms, but for their mean, are therefore
-compared with those of the radiance where their rays go on to,
+is fixed in direction: as the camera moves, it moves over the pane. Of pixels that show the same
+place of a thing in several frames, the logarithms, but for their mean, are therefore compared with
+those of the radiance that other frames show in the directions in which their rays go on,
 
-    log L - <log L> = s (log L_behind - <log L_behind>) + m (log L_mirrored - <log L_mirrored>),
+    log L - <log L> = s (log L_behind - <log L_behind>) + m (log L_mirrored - <log L_mirrored>).
 
-which textures tell that other frames measured, and where rays leave the scan, what other frames
-show in that direction. Of a pane s is near 1, whatever its tint, and of all else near 0. Where
-nothing differs behind it, nothing is told, and nothing depends on it: there a pane shines like a
-surface that is as bright.
+Of a pane s is near 1, whatever its tint, and of all else near 0. A rough metal too shows much the
+same in one direction, but no more than it mirrors. Where nothing differs behind a pane, nothing is
+told, and nothing depends on it: there a pane shines like a surface that is as bright.
 """
 
 from __future__ import annotations
@@ -36,12 +35,12 @@ from usdbrdf.transport.surface_texture import SurfaceTexture
 
 # So many pixels of a frame are asked at most, and of all.
 _PIXELS, _ALL_PIXELS = 1 << 14, 1 << 22
-# Directions in which rays leave the scan; places of a thing, and behind it: parts of a diagonal.
-_HEIGHT, _WIDTH, _PLACES, _BEHIND = 128, 256, 128, 256
+# Directions in which rays leave the scan; places of a thing: parts of its diagonal.
+_HEIGHT, _WIDTH, _PLACES = 128, 256, 128
 # Walls of one thing that are passed on the way: both of each of a few panes.
 _MOST_LAYERS = 8
-# Bits of a coordinate of a place, and of a frame's number; metres, farther than anything behind.
-_BITS, _FRAMES, _FAR = 12, 24, 1e5
+# Bits of a coordinate of a place, and of a frame's number.
+_BITS, _FRAMES = 12, 24
 # Parts of the frames, each left out in turn.
 _PARTS = 8
 _COSINE = calibration.number("panes.cosine")
@@ -50,22 +49,21 @@ _FARTHEST = calibration.number("panes.farthest")
 _FEWEST = calibration.count("panes.fewest")
 _SLOPE = calibration.number("panes.slope")
 _EXPLAINED = calibration.number("panes.explained")
-_NEAR, _FAR_AWAY = calibration.pair("panes.over_mirrored")
+_OVER = calibration.number("panes.over_mirrored")
 _ABOVE = calibration.number("panes.above_mirrored")
 
 
 class _Rays(NamedTuple):
-    """R pixels whose rays go on behind what they meet: its object, place and frame; the mean of the
-    channels of what they show, of what is where the ray goes on to, and of what would be mirrored,
-    NaN where unknown; and where the ray goes on to, a place or, less than 0, a direction."""
+    """R pixels whose rays leave the scan behind what they meet: its object, place and frame; the
+    mean of the channels of what they show and of what would be mirrored, NaN where unknown; and the
+    number of the direction."""
 
     object: Int
     place: Long
     frame: Long
     shown: Float
-    behind: Float
     mirrored: Float
-    aim: Long
+    direction: Long
 
     @staticmethod
     def joined(parts: list[_Rays]) -> _Rays:
@@ -86,27 +84,24 @@ class Through(NamedTuple):
     mirrored: float
     above: float
 
-    def is_pane(self, outside: bool) -> bool:
-        """outside: behind it the rays leave the scan. What is there is known by the pixels alone,
-        and a rough metal too shows much the same in one direction; but no more than it mirrors."""
-        if self.slope - 2 * self.error < _SLOPE or self.explained < _EXPLAINED:
-            return False
-        if not outside:
-            return self.explained > _NEAR * self.mirrored
-        return self.above > _ABOVE and self.explained > _FAR_AWAY * self.mirrored
+    @property
+    def is_pane(self) -> bool:
+        """Whether nothing but a pane does so."""
+        follows = self.slope - 2 * self.error > _SLOPE and self.explained > _EXPLAINED
+        return follows and self.above > _ABOVE and self.explained > _OVER * self.mirrored
 
 
 def find_panes(
     run: TaskRun, surface: TexturedScene, lit: Float, coverage: CoverageMap, frames: Frames,
     z_up: bool,
 ) -> tuple[int, ...]:  # fmt: skip
-    """The numbers of the objects through which frames show what is behind; lit (T, 3): L_d."""
+    """The numbers of the objects through which frames show the outside; lit (T, 3): L_d."""
 
     def compute() -> dict[str, Array]:
         told = what_shows_through(surface, lit, coverage, frames, z_up)
-        return {"panes": np.unique([k for (k, out), one in told.items() if one.is_pane(out)])}
+        return {"panes": np.array([k for k, one in told.items() if one.is_pane])}
 
-    # What is all one object shows nothing of what is behind it.
+    # What is all one object has no panes of its own.
     if len(surface.scene.objects) < 2:
         return ()
     return tuple(run.checkpoint("panes", compute)["panes"].astype(np.int64).tolist())
@@ -126,9 +121,8 @@ def beside_panes(
 
 def what_shows_through(
     surface: TexturedScene, lit: Float, coverage: CoverageMap, frames: Frames, z_up: bool
-) -> dict[tuple[int, bool], Through]:
-    """Of objects that tell: through which what is in the scan shows, and through which (True) what
-    is outside; lit (T, 3): L_d as texturing left it."""
+) -> dict[int, Through]:
+    """How the outside shows through each object that tells; lit (T, 3): L_d."""
     known = np.where(coverage.measured, lit.mean(axis=1), np.nan).astype(np.float32)
     asked = _Asked(surface, surface.texture(np.repeat(known[:, None], 3, axis=1)), z_up)
     most = min(_PIXELS, _ALL_PIXELS // max(len(frames), 1))
@@ -137,27 +131,25 @@ def what_shows_through(
         _of_frame(asked, frames.camera(i), pixels, i, most)
         for i, pixels in progress(images, total=len(frames), label="shade: panes", unit="frames")
     ])  # fmt: skip
-    unseen = np.isnan(rays.behind)
-    rays.behind[unseen] = _in_other_frames(rays.of(unseen))
     with np.errstate(divide="ignore", invalid="ignore"):
-        logs = {name: np.log(getattr(rays, name)) for name in ("shown", "behind", "mirrored")}
-    rays = rays._replace(**logs)
+        behind = np.log(_in_other_frames(rays))
+        shown, mirrored = np.log(rays.shown), np.log(rays.mirrored)
     # What mirrors something bright shows that, and little else.
-    told = np.isfinite(rays.shown) & np.isfinite(rays.behind) & np.isfinite(rays.mirrored)
-    rays = rays.of(told & (rays.mirrored < rays.shown + np.log(_DIM)))
+    told = np.isfinite(shown) & np.isfinite(behind) & (mirrored < shown + np.log(_DIM))
+    told &= np.isfinite(mirrored)
     found = {}
-    for k in np.unique(rays.object).tolist():
-        own = rays.of(rays.object == k)
-        for outside in (False, True):
-            if (one := _told(own.of((own.aim < 0) == outside))) is not None:
-                found[k, outside] = one
+    for k in np.unique(rays.object[told]).tolist():
+        own = told & (rays.object == k)
+        logs = np.stack([shown[own], behind[own], mirrored[own]])
+        if (one := _told(rays.of(own), logs)) is not None:
+            found[k] = one
     return found
 
 
 def _in_other_frames(rays: _Rays) -> Float:
-    """What other frames than their own show where each of R rays goes on to, on the mean of two or
-    more; NaN where fewer do."""
-    _, aim = np.unique(rays.aim, return_inverse=True)
+    """What other frames than their own show in the direction of each of R rays, on the mean of two
+    or more; NaN where fewer do."""
+    _, aim = np.unique(rays.direction, return_inverse=True)
     pair, of_pair = np.unique((aim << _FRAMES) + rays.frame, return_inverse=True)
     level = np.bincount(of_pair, rays.shown) / np.bincount(of_pair)
     aim = pair >> _FRAMES
@@ -186,8 +178,8 @@ def _of_frame(asked: _Asked, camera: Camera, pixels: FramePixels, frame: int, mo
     cosine = np.einsum("rc,rc->r", points.normal, points.to_camera)
     counts = (alone & pixels.valid[part]).ravel() & (owner >= 0) & (cosine > _COSINE)
     which = np.flatnonzero(counts)
+    which = which[_leaves(surface, points.take(which), owner[which])]
     points, owner, cosine = points.take(which), owner[which], cosine[which]
-    behind, aim = _behind(asked, points, owner)
     turned = 2 * cosine[:, None] * points.normal - points.to_camera
     origin = lift_from_surface(points.position, points.normal, surface.diagonal_m)
     met = surface.rays.closest(origin, np.ascontiguousarray(turned, np.float32))
@@ -197,9 +189,8 @@ def _of_frame(asked: _Asked, camera: Camera, pixels: FramePixels, frame: int, mo
         place=_places(points.position, _sides(surface)[owner, None]),
         frame=np.full(len(which), frame, np.int64),
         shown=pixels.radiance[part].mean(axis=2).ravel()[which].astype(np.float32),
-        behind=behind,
         mirrored=np.where(met.face < 0, np.float32(np.nan), mirrored),
-        aim=aim,
+        direction=pixels_of_directions(-points.to_camera, _HEIGHT, _WIDTH, asked.z_up),
     )
 
 
@@ -221,38 +212,34 @@ def _places(position: Float, side: Double | float) -> Long:
     return place
 
 
-def _behind(asked: _Asked, points: SurfacePoints, owner: Int) -> tuple[Float, Long]:
-    """What rays from the camera meet behind the objects that they meet first, and where: the
-    radiance (R,) that was measured there, and the place, or the direction, less than 0."""
-    surface, count = asked.surface, len(owner)
-    behind, aim = np.full(count, np.nan, np.float32), np.zeros(count, np.int64)
+def _leaves(surface: TexturedScene, points: SurfacePoints, owner: Int) -> Bool:
+    """(R,): the ray from the camera meets nothing behind the object that it meets first."""
+    leaves = np.zeros(len(owner), np.bool_)
     direction = np.ascontiguousarray(-points.to_camera, np.float32)
     origin = lift_from_surface(points.position, direction, surface.diagonal_m)
-    left = np.arange(count)
+    left = np.arange(len(owner))
     for _ in range(_MOST_LAYERS):
         if not len(left):
             break
         hits = surface.rays.closest(origin, direction[left])
-        reached = origin + direction[left] * np.minimum(hits.distance, _FAR)[:, None]
-        own, missed = surface.owner(hits.face) == owner[left], hits.face < 0
-        met, out = ~own & ~missed, left[missed]
-        behind[left[met]] = asked.texture.at(hits.face[met], hits.u[met], hits.v[met])[:, 0]
-        aim[left[met]] = _places(reached[met], surface.diagonal_m / _BEHIND)
-        aim[out] = -1 - pixels_of_directions(direction[out], _HEIGHT, _WIDTH, asked.z_up)
+        leaves[left[hits.face < 0]] = True
+        own = surface.owner(hits.face) == owner[left]
+        reached = origin[own] + direction[left[own]] * hits.distance[own, None]
         left = left[own]
-        origin = lift_from_surface(reached[own], direction[left], surface.diagonal_m)
-    return behind, aim
+        origin = lift_from_surface(reached, direction[left], surface.diagonal_m)
+    return leaves
 
 
-def _told(rays: _Rays) -> Through | None:
-    """What the rays of one object tell; None where they are too few."""
+def _told(rays: _Rays, logs: Float) -> Through | None:
+    """What the rays of one object tell by the logarithms of what they show, what is behind and
+    what would be mirrored, (3, R); None where they are too few."""
     _, place = np.unique(rays.place, return_inverse=True)
     pair = np.unique((place << _FRAMES) + rays.frame) >> _FRAMES
     several = (np.bincount(pair, minlength=1) > 1)[place]
-    rays, place = rays.of(several), place[several]
+    rays, place, logs = rays.of(several), place[several], logs[:, several]
     if len(place) < _FEWEST:
         return None
-    values = [_within(one, place) for one in (rays.shown, rays.behind, rays.mirrored)]
+    values = [_within(one, place) for one in logs]
     parts = [np.stack([one[rays.frame % _PARTS == k] for one in values]) for k in range(_PARTS)]
     products = np.stack([part @ part.T for part in parts])
     every = products.sum(axis=0)
@@ -260,7 +247,7 @@ def _told(rays: _Rays) -> Through | None:
     squares = np.maximum(np.diag(every), 1e-30)
     explained, mirrored = (every[0, 1:] ** 2 / (squares[0] * squares[1:])).tolist()
     error = float(np.sqrt((_PARTS - 1) * np.var(without)))
-    above = float(np.median(rays.shown - rays.mirrored))
+    above = float(np.median(logs[0] - logs[2]))
     return Through(_slope(every), error, explained, mirrored, above)
 
 
