@@ -178,7 +178,13 @@ class AssetMaps:
     def surface(self) -> TexturedScene:
         """Scene and texels as light transport takes them."""
         rays = RayScene(self.scene.points, self.scene.triangles)
-        return TexturedScene(self.scene, self.texels, rays)
+        return TexturedScene(self.scene, self.texels, rays, self._panes)
+
+    @property
+    def _panes(self) -> tuple[int, ...]:
+        """The numbers of the objects that shading found to let light through."""
+        found = (read_shading(self.stage, obj.prim_path) for obj in self.scene.objects)
+        return tuple(i for i, one in enumerate(found) if one and one.lets_through)
 
     @cached_property
     def coverage(self) -> CoverageMap:

@@ -288,6 +288,9 @@ class ShadedObject(MeasuredObject):
         was said by a person, in review.usda or in the capture's objects. lamp: it does;
         not-lamp: it does not; empty where its radiance told.""", tokens=OF_SHADE,
         when=lambda shaded: bool(shaded.directive))] = ""
+    lets_through: Annotated[bool, Fact(SHADING, "letsThrough", "bool", False, """True where
+        photographs show the outside through the object, as through a pane: light was then
+        traced as if it was not there.""", when=lambda shaded: shaded.lets_through)] = False
     area_fraction: Annotated[float, Fact(EMITTER, "areaFraction", "float", 0.0, """Share of the
         object's surface that emits; 0 to 1, without unit.""", low=0, high=1, absent=0.0)]
 

@@ -45,7 +45,7 @@ def mirror_hits_emitter(lit: LitScene, points: SurfacePoints) -> Bool:
     along = np.einsum("rd,rd->r", points.normal, points.to_camera)[:, None]
     reflected = np.ascontiguousarray(2 * along * points.normal - points.to_camera, np.float32)
     origin = lift_from_surface(points.position, points.normal, lit.diagonal_m)
-    hits = lit.rays.closest(origin, reflected)
+    hits = lit.light_rays.closest(origin, reflected)
     return lit.emits(hits) & (hits.face >= 0) & (points.face >= 0)
 
 

@@ -291,7 +291,7 @@ class Follower:
             half /= np.linalg.norm(half, axis=1, keepdims=True)
             along = 2 * np.einsum("td,td->t", half, to_eye)[:, None]
             direction = np.ascontiguousarray(along * half - to_eye, np.float32)
-            hits = self._lit.rays.closest(origin, direction)
+            hits = self._lit.light_rays.closest(origin, direction)
             total += self._lit.radiance.at(hits.face, hits.u, hits.v).mean(axis=1)
         mean: Float = total / np.float32(len(self._jitter))
         return mean

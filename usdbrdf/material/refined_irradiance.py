@@ -64,7 +64,7 @@ def _changed_irradiance(given: _Change, index: Long, patch: Int) -> dict[str, Ar
     lit, lobes, texels = given.lit, given.lobes, given.lit.texels
     position, normal = texels.position[index], texels.normal[index]
     diffuse = irradiance_at(
-        lit.rays, given.radiance, given.lights, black_environment(), position, normal, patch,
+        lit.light_rays, given.radiance, given.lights, black_environment(), position, normal, patch,
         given.sampling, lit.diagonal_m,
     )  # fmt: skip
     specular = specular_irradiance(
@@ -120,8 +120,9 @@ def _scattered(given: _Scattering, index: Long, patch: Int) -> dict[str, Array]:
     if len(inner):
         normal, sun = texels.normal[inner], lit.environment.sun
         found[own] = irradiance_at(
-            lit.rays, given.radiance, given.lights, lit.environment, texels.position[inner], normal,
-            patch[own], given.sampling, lit.diagonal_m, by_angle=ByAngle(given.differs, surface),
+            lit.light_rays, given.radiance, given.lights, lit.environment, texels.position[inner],
+            normal, patch[own], given.sampling, lit.diagonal_m,
+            by_angle=ByAngle(given.differs, surface),
         ).mean  # fmt: skip
         of_sun = share_let_through(lobes.phi[surface], lobes.psi[surface], normal @ sun.direction)
         found[own] += (of_sun - 1)[:, None] * sunlight(lit, inner, sun, given.sampling.seed)
@@ -141,7 +142,7 @@ def let_through_surfaces(
     given = _Scattering(
         lit,
         lit.radiance.showing(texels, light),
-        lights_from_radiance(lit.scene, texels, light, outside=(lit.rays, lit.environment)),
+        lights_from_radiance(lit.scene, texels, light, outside=(lit.light_rays, lit.environment)),
         lobes,
         Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED),
         table_let_through(lobes.phi, lobes.psi) - 1,

@@ -80,7 +80,7 @@ class Shining(NamedTuple):
         cls, surface: TexturedScene, light: Float, environment: Environment | None = None
     ) -> Shining:
         """light (T, 3), W/(m^2 sr); environment: what shines in from outside, if it counts."""
-        outside = (surface.rays, environment) if environment else None
+        outside = (surface.light_rays, environment) if environment else None
         lights = lights_from_radiance(surface.scene, surface.texels, light, outside=outside)
         return cls(surface.texture(light), lights)
 
@@ -96,7 +96,7 @@ def irradiance_of_texels(
     """S (N, 3), W/m^2, of a few texels in the light of the surfaces and what is outside."""
     texels = surface.texels
     return sunlight(surface, index, outside.sun, seed) + irradiance_at(
-        surface.rays, *shining, outside, texels.position[index], texels.normal[index],
+        surface.light_rays, *shining, outside, texels.position[index], texels.normal[index],
         independent_tiles(len(index)), replace(sampling, seed=seed), surface.diagonal_m,
     ).mean  # fmt: skip
 
@@ -108,4 +108,4 @@ def looked_around(surface: TexturedScene, index: Long, seed: int, rays: int) -> 
     normal = texels.normal[index]
     origin = lift_from_surface(texels.position[index], normal, surface.diagonal_m)
     towards = cosine_rays(normal, index, seed, rays)
-    return towards, surface.rays.closest(origin, towards).face
+    return towards, surface.light_rays.closest(origin, towards).face

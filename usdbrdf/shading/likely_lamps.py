@@ -191,7 +191,7 @@ def _shares(
             cosines = (towards * normal).sum(axis=1), -(towards * texels.normal[point]).sum(axis=1)
             facing = np.maximum(cosines, 0).prod(axis=0)
             sent = np.where(facing[:, None] > 0, towards, 0).astype(np.float32)
-            hits = surface.rays.closest(origin, sent)
+            hits = surface.light_rays.closest(origin, sent)
             met = (hits.face >= 0) & (surface.scene.face_object[np.maximum(hits.face, 0)] == thing)
             met &= hits.distance > _REACHED * distance
             share += np.minimum(met * facing * below[-1] / distance**2, np.pi) / points

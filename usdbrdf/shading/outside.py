@@ -158,7 +158,7 @@ def estimated_outside(
     whether they are lamps, where that is known."""
 
     def compute() -> dict[str, Array]:
-        seen = surroundings_from_frames(surface.rays, frames, z_up)
+        seen = surroundings_from_frames(surface.light_rays, frames, z_up)
         # What hides in a room would shine like what stands in the sun beside it.
         lamps, known = KnownLamps.unknown(coverage.clipped), _of_measured(seen, z_up)
         light = light_of_hidden(surface, lit, coverage, known, seed, lamps)

@@ -25,6 +25,7 @@ from usdbrdf.shading.base_color import albedo_map, clear_of
 from usdbrdf.shading.clipped_light import ClippedLight, clipped_groups, estimate_clipped_light
 from usdbrdf.shading.hidden_light import KnownLamps, said_to_shine, with_hidden_light
 from usdbrdf.shading.outside import Outside
+from usdbrdf.shading.panes import beside_panes
 from usdbrdf.shading.unseen_lamps import UnseenLamps, estimate_unseen_lamps
 from usdbrdf.texturing.inpaint import telling
 from usdbrdf.transport.denoise import OIDN, denoise_lightmaps
@@ -180,7 +181,7 @@ class _LitTexels(NamedTuple):
 def _irradiance(given: _LitTexels, index: Long, patch: Int) -> dict[str, Array]:
     surface, texels = given.surface, given.surface.texels
     found = irradiance_at(
-        surface.rays, given.radiance, given.lights, given.environment, texels.position[index],
+        surface.light_rays, given.radiance, given.lights, given.environment, texels.position[index],
         texels.normal[index], patch, given.sampling, surface.diagonal_m, given.dark[index],
     )  # fmt: skip
     mean = found.mean + sunlight(surface, index, given.environment.sun, given.sampling.seed)
@@ -192,7 +193,7 @@ def trace_irradiance(
 ) -> Irradiance:
     """S at all texels with the radiance ``lit`` (T, 3) as the light."""
     texels = surface.texels
-    radiance, outside = surface.texture(lit), (surface.rays, environment)
+    radiance, outside = surface.texture(lit), (surface.light_rays, environment)
     lights = lights_from_radiance(surface.scene, texels, lit, outside=outside)
     # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
     # surfaces lit from outside the scan.
@@ -230,6 +231,7 @@ class Shaded:
     unexplained     (T,): more comes from a measured reflector than reaches it, its albedo is 1
     over_one        the share of these
     outside         the light from outside; None for none
+    panes           the numbers of the objects that light passes through
     """
 
     measured: Bool
@@ -243,6 +245,7 @@ class Shaded:
     unexplained: Bool
     over_one: float
     outside: Outside | None
+    panes: tuple[int, ...] = ()
 
     @property
     def emission(self) -> Float:
@@ -448,12 +451,15 @@ def shade_surface(
     said     of objects, by number, whether they are lamps, where a person says so
     """
     environment = outside.environment if outside else black_environment()
-    light, unseen = _light(run, surface, lit, coverage, frames, outside, sampling.seed, said)
+    panes, dark = surface.of_panes()[:, None], dict.fromkeys(surface.panes, False)
+    sent = *beside_panes(surface, lit, coverage), frames, outside, sampling.seed, dict(said) | dark
+    light, unseen = _light(run, surface, *sent)
     filtered = lightmap_filter == OIDN
     if filtered:
         sampling = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)
     traced = trace_irradiance(run, surface, light.lit, environment, sampling)
     irradiance = denoised_irradiance(surface.texels, traced.mean) if filtered else traced.mean
+    light = replace(light, lit=np.where(panes, lit, light.lit))
     texels, seen = surface.texels, coverage.measured
     may_shine = light.may_shine(coverage.clipped)
     doubt = _doubt(texels, light, unseen, outside, seen, irradiance)
@@ -469,6 +475,6 @@ def shade_surface(
     return Shaded(
         measured=coverage.measured, light=light, traced=traced, relative_error=relative,
         irradiance=irradiance, unseen=unseen, emitters=emitters, albedo=albedo, unexplained=over,
-        outside=outside,
+        outside=outside, panes=surface.panes,
         over_one=float(over.sum() / max((seen & ~emitters.emissive).sum(), 1)),
     )  # fmt: skip

@@ -59,7 +59,7 @@ def find_sun(
         cosine = np.maximum(directions @ normal.T, 0)
         rays = np.repeat(directions.astype(np.float32), len(origin), axis=0)
         rays[cosine.ravel() == 0] = 0  # what looks away need not be traced
-        free = surface.rays.closest(origin, rays).face < 0
+        free = surface.light_rays.closest(origin, rays).face < 0
         share = cosine * free.reshape(cosine.shape)
         return _costs(reflected, without, share, asked.clipped, first, strengths)
 

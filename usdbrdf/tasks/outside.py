@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from usdbrdf.asset.layout import Asset
@@ -14,11 +15,26 @@ from usdbrdf.job.progress import warn
 from usdbrdf.job.task import TaskRun
 from usdbrdf.options import NO_LIGHT, ShadeOptions
 from usdbrdf.shading.outside import Outside, estimated_outside
+from usdbrdf.shading.panes import beside_panes, find_panes
 from usdbrdf.transport.environment import environment_from_file, unknown_primaries
+from usdbrdf.transport.lit_scene import TexturedScene
+
+
+def with_panes(
+    run: TaskRun, maps: AssetMaps, up_axis: str, said: Mapping[int, bool]
+) -> TexturedScene:
+    """The scene with the panes that the capture shows; what a person calls a lamp is none."""
+    found = find_panes(run, maps.surface, maps.lit, maps.coverage, maps.frames, up_axis == "Z")
+    return replace(maps.surface, panes=tuple(i for i in found if not said.get(i)))
 
 
 def outside_of(
-    run: TaskRun, maps: AssetMaps, options: ShadeOptions, up_axis: str, said: Mapping[int, bool]
+    run: TaskRun,
+    maps: AssetMaps,
+    surface: TexturedScene,
+    options: ShadeOptions,
+    up_axis: str,
+    said: Mapping[int, bool],
 ) -> Outside | None:
     """The light from outside as a file tells it, or the capture; None without any. said: of
     objects, by number, whether they are lamps, where a person says so."""
@@ -28,8 +44,9 @@ def outside_of(
         return Outside.given(environment_from_file(options.environment, up_axis))
     if options.environment == NO_LIGHT:
         return None
+    lit, coverage = beside_panes(surface, maps.lit, maps.coverage)
     return estimated_outside(
-        run, maps.surface, maps.frames, maps.lit, maps.coverage, up_axis == "Z",
+        run, surface, maps.frames, lit, coverage, up_axis == "Z",
         options.sampling.seed, said,
     )  # fmt: skip
 

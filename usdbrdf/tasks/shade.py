@@ -22,7 +22,7 @@ from usdbrdf.model.mesh import LAMP, OF_SHADE
 from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
 from usdbrdf.shading.lamp_shapes import shapes_of_object
 from usdbrdf.shading.shaded import Shaded, shade_surface
-from usdbrdf.tasks.outside import outside_of, write_outside
+from usdbrdf.tasks.outside import outside_of, with_panes, write_outside
 from usdbrdf.tasks.task import Task, warned
 from usdbrdf.transport.denoise import chosen_filter
 
@@ -47,8 +47,9 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
 
     def work(run: TaskRun) -> dict[str, Any]:
         said = {i: word == LAMP for i, word in by_number(asked, maps.scene.objects).items()}
-        outside = outside_of(run, maps, options, task.header.up_axis, said)
-        given = maps.surface, maps.lit, maps.coverage, maps.frames, outside
+        surface = with_panes(run, maps, task.header.up_axis, said)
+        outside = outside_of(run, maps, surface, options, task.header.up_axis, said)
+        given = surface, maps.lit, maps.coverage, maps.frames, outside
         shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said)
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
@@ -58,12 +59,9 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
         ]
         layer = run.output(f"layers/{asset.layer('shading').name}")
         write_shading_layer(layer, task.draft, objects, published)
+        shapes = partial(shapes_of_object, maps.scene, maps.texels, shaded.emission)
         lamps = [
-            Lamp(
-                prim_path=item.prim_path,
-                identifier=item.identifier,
-                shapes=shapes_of_object(maps.scene, maps.texels, shaded.emission, i),
-            )
+            Lamp(prim_path=item.prim_path, identifier=item.identifier, shapes=shapes(i))
             for i, item in enumerate(objects)
             if item.emitter
         ]
@@ -115,6 +113,7 @@ def _write_maps(writer: MapWriter, shaded: Shaded) -> list[ShadedObject]:
                 rays_per_texel=float(traced.rays[own].mean()),
                 standard_error=float(np.median(shaded.relative_error[own])),
                 escaped_fraction=float(mean(traced.escaped)),
+                lets_through=i in shaded.panes,
             )
         )
     return objects

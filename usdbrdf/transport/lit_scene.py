@@ -24,11 +24,28 @@ from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 
 @dataclass(frozen=True)
 class TexturedScene:
-    """A scene, its texels, and Embree's tree of its triangles."""
+    """A scene, its texels, and Embree's tree of its triangles: what cameras see; panes, the
+    numbers of the objects that light passes through."""
 
     scene: Scene
     texels: Texels
     rays: RayScene
+    panes: tuple[int, ...] = ()
+
+    @cached_property
+    def light_rays(self) -> RayScene:
+        """What light meets: all but the panes, triangles with the same numbers."""
+        if not self.panes:
+            return self.rays
+        triangles = self.scene.triangles.copy()
+        passed = np.isin(self.scene.face_object, self.panes)
+        # Rays meet no triangle without an area.
+        triangles[passed] = triangles[passed, :1]
+        return RayScene(self.scene.points, triangles)
+
+    def of_panes(self) -> Bool:
+        """(T,): the texel is a pane's."""
+        return np.asarray(np.isin(self.texels.object_index(), self.panes), np.bool_)
 
     @cached_property
     def diagonal_m(self) -> float:
@@ -99,7 +116,7 @@ def visible_points(lit: LitScene, camera: Camera, pixels: Double) -> SurfacePoin
     return points_of_rays(lit, *camera.rays(pixels))
 
 
-def points_of_rays(lit: LitScene, origins: Float, directions: Float) -> SurfacePoints:
+def points_of_rays(lit: TexturedScene, origins: Float, directions: Float) -> SurfacePoints:
     """The surface that rays (R, 3) meet first, seen from where they come."""
     hits = lit.rays.closest(origins, directions)
     face = np.maximum(hits.face, 0)
@@ -132,9 +149,14 @@ def lit_scene(
         scene=surface.scene,
         texels=surface.texels,
         rays=surface.rays,
+        panes=surface.panes,
         radiance=radiance,
         lights=lights_from_radiance(
-            surface.scene, surface.texels, light, _BRIGHTER_THAN, (surface.rays, environment)
+            surface.scene,
+            surface.texels,
+            np.where(surface.of_panes()[:, None], np.float32(0), light),
+            _BRIGHTER_THAN,
+            (surface.light_rays, environment),
         ),
         emission=radiance.showing(surface.texels, shines),
         environment=environment,

@@ -370,7 +370,7 @@ def trace_lobe_samples(
     draw_directions(count, aimed, origin, draws, mixture, groups)
     if mixture.sun:
         aimed.direction[:, -1] = towards_sun(sun, shifts_of(draws.number, 2, seed ^ _SUN_SEED))
-    hits = lit.rays.closest(np.repeat(origin, total, axis=0), directions)
+    hits = lit.light_rays.closest(np.repeat(origin, total, axis=0), directions)
     cos_in, sin2_half, cos_half = np.zeros((3, count, total), np.float32)
     arriving = lit.radiance.at(hits.face, hits.u, hits.v).reshape(count, total, 3)
     cos_out = np.einsum("rd,rd->r", points.normal, points.to_camera)

@@ -54,13 +54,13 @@ def _share(surface: TexturedScene, index: Long, sun: Sun, seed: int, samples: ra
     position = (position + down * texels.step_y[index, None]).reshape(-1, 3)
     normal = np.repeat(texels.geometric_normal[index], count, axis=0)
     origin = lift_from_surface(position, normal, surface.diagonal_m)
-    hits = surface.rays.closest(origin, towards_sun(sun, drawn[..., 2:].reshape(-1, 2)))
+    hits = surface.light_rays.closest(origin, towards_sun(sun, drawn[..., 2:].reshape(-1, 2)))
     free = (hits.face < 0).reshape(-1, count)
     # Some of a texel's square lies beyond another wall, where the sun may shine, or, where the
     # surface is hollow, below the next triangle, where it does not.
     centre = lift_from_surface(texels.position[index], texels.geometric_normal[index],
                                surface.diagonal_m).repeat(count, axis=0)  # fmt: skip
-    way = surface.rays.closest(centre, origin - centre)
+    way = surface.light_rays.closest(centre, origin - centre)
     before = ((way.face < 0) | (way.distance > 1)).reshape(-1, count)
     num_before = before.sum(axis=1)
     share = (free & before).sum(axis=1) / np.maximum(num_before, 1)
