@@ -52,6 +52,13 @@ def test_what_a_person_left_out_needs_no_look():
     assert "pane" not in "\n".join(lines)
 
 
+def test_a_pane_needs_no_look():
+    objects = {"pane": {**_fit("prior"), "kind": "transparent"}, "a": _fit("measured", phi=0.1)}
+    lines = table({**STEPS, "fit": {"objects": objects}}, ROOT)
+    assert lines[0].endswith("2: 1 measured, 1 panes before the outside")
+    assert "a look" not in "\n".join(lines)
+
+
 def test_a_long_list_is_cut():
     objects = {f"thing_{i:02d}": _fit("prior", phi=0.5, psi=0.5) for i in range(40)}
     lines = table({**STEPS, "fit": {"objects": objects}}, ROOT)

@@ -14,6 +14,7 @@ _WORDS = {
     "measured": ("measured", ""),
     "lamp": ("lamps", ""),
     "unfitted": ("not fitted, as a person asked", ""),
+    "pane": ("panes before the outside", ""),
     "prior": ("not determined", "frames that see highlights on them would tell"),
     "unseen": ("unseen", "frames show too little of them: all about them but a colour is a guess"),
     "failed": ("failed", "the target frame does not determine them"),
@@ -57,6 +58,8 @@ def statuses_of(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
         if name in lamps
         else "unfitted"
         if found.get("directive") in _NOT_FITTED
+        else "pane"
+        if found.get("kind") == "transparent"
         else str(found["status"])
         for name, found in steps["fit"]["objects"].items()
     }

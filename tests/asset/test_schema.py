@@ -130,8 +130,8 @@ def test_every_attribute_is_known_and_documented(name):
 
 def test_what_is_declared_is_authored_and_the_reverse(built):
     """Names, types and variability. The lamp of the small asset is an estimated one; one of its
-    objects is made a metal, as a person asked, another a lamp, and its photographs were taken
-    through a lens, in log, by day."""
+    objects is made a metal, as a person asked, another a lamp, another a pane, and its photographs
+    were taken through a lens, in log, by day."""
     verify()
     frames = built.scan.frames
     paths = frames.image_paths
@@ -147,7 +147,7 @@ def test_what_is_declared_is_authored_and_the_reverse(built):
     built.fitted = (metal, *others)
     built.write_layer("material")
     lamp, *dark = built.shaded
-    built.shaded = (replace(lamp, directive="lamp"), *dark)
+    built.shaded = (replace(lamp, directive="lamp"), replace(dark[0], lets_through=True), *dark[1:])
     built.outside = sky_of(built.asset)
     built.write_layer("shading")
     built.scan = replace(built.scan, frames=replace(frames, lightings=("day",) * len(frames)))

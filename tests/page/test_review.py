@@ -54,6 +54,9 @@ def test_of_a_metal_by_directive_the_page_says_no_more_than_is_known(numbers, to
 def test_of_what_is_seen_through_page_and_run_say_so():
     found = fit(status="prior", contradiction=0.45)
     assert "Its views contradict by 45% that it is a surface" in why(found, "prior", None)
+    assert "shows the outside through it" not in why(fit(), "prior", None)
+    pane = why(fit(status="prior", kind="transparent"), "prior", None)
+    assert pane.startswith("Photographs show the outside through it")
     assert not fit().doubts
     (told,) = found.doubts
     assert told.startswith("chair: 45% of its light changes between views ")
@@ -66,6 +69,7 @@ def test_of_what_is_seen_through_page_and_run_say_so():
         ({"evidence": math.nan}, "sparse", "1 is seen in too few pixels for a fit"),
         ({"contradiction": 0.45}, "contradicted", "The views of 1 contradict that it is a surface"),
         ({"directive": "glass", "evidence": math.nan}, "told", "1 was not fitted, by directive."),
+        ({"kind": "transparent"}, "pane", "1 is a pane before the outside."),
     ],
 )
 def test_the_page_tells_apart_why_numbers_are_not_determined(numbers, reason, told):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from pxr import UsdShade
 
@@ -17,7 +18,9 @@ from usdbrdf.asset.readers.render_scene import render_scene_from_stage, time_cod
 from usdbrdf.asset.readers.scene import read_fit, read_shading
 from usdbrdf.asset.review import Judgement, write_review
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.images import write_exr
 from usdbrdf.model.mesh import OF_FIT
+from usdbrdf.tasks import outside
 from usdbrdf.validation.validate import has_errors, validate
 
 OPTIONS = usdbrdf.ConvertOptions(
@@ -98,6 +101,43 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
         surface = UsdShade.Shader.Get(stage, "/room/geo/floor/mtl/floor/PreviewSurface")
         assert surface.GetInput("metallic").Get() == 1
         assert not has_errors(validate(asset.root_layer))
+
+
+def test_panes_are_clear_glass_unless_a_person_says_otherwise(tmp_path, monkeypatch):
+    """How they are known is tested where that is done; without an outside they are surfaces."""
+    monkeypatch.setattr(outside, "find_panes", lambda *_: (capture.names.index("walls"),))
+    capture = make_capture(tmp_path / "scan", subdivisions=2, poses=poses_down_and_up(6, 4))
+    sky = tmp_path / "sky.exr"
+    write_exr(sky, np.ones((8, 16, 3), np.float32))
+    folder = tmp_path / "room"
+    of_shade = replace(OPTIONS.shade, environment=sky)
+
+    def found(shade, **words):
+        fit = replace(OPTIONS.fit, environment=shade.environment)
+        usdbrdf.convert(capture.folder, folder, replace(OPTIONS, shade=shade, fit=fit))
+        asset = Asset.made(folder)
+        if words:
+            _say(asset, **words)
+            usdbrdf.convert(capture.folder, folder, replace(OPTIONS, shade=shade, fit=fit))
+        stage = open_measured(asset)
+        assert not has_errors(validate(asset.root_layer))
+        path = "/room/geo/walls/walls"
+        return stage, read_shading(stage, path), read_fit(stage, path)
+
+    stage, shaded, fitted = found(of_shade)
+    assert shaded.lets_through
+    assert not read_shading(stage, "/room/geo/box/box").lets_through
+    assert (fitted.kind, fitted.directive, fitted.num_pixels) == ("transparent", "", 0)
+    rendered = render_scene_from_stage(stage, time_code(stage, None), lambda _: None)
+    assert [s.name for s in rendered.surfaces if s.material.clear] == ["/room/geo/walls/walls"]
+    # The floor, which the walls' light reached alone, is lit by the sky as well.
+    lit_by_sky = read_shading(stage, "/room/geo/floor/floor").escaped_fraction
+    assert lit_by_sky > 0.05
+    _, shaded, fitted = found(of_shade, walls="refit")
+    assert (shaded.lets_through, fitted.kind, fitted.directive) == (True, "dielectric", "refit")
+    stage, shaded, fitted = found(OPTIONS.shade)
+    assert (shaded.lets_through, fitted.kind) == (False, "dielectric")
+    assert read_shading(stage, "/room/geo/floor/floor").escaped_fraction < lit_by_sky
 
 
 def test_a_word_that_is_none_stops_the_step_that_reads_it(built):

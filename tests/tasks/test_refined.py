@@ -25,7 +25,7 @@ def published(fit: ObjectFit, *, microfacet: bool = True):
         prim_path="/a/b", identifier="b", label="b", class_name="", first_face=0, num_faces=1
     )
     maps = SimpleNamespace(scene=SimpleNamespace(objects=[thing]), is_observed=lambda _: True)
-    [found] = fitted_objects([maps], [fit], FitOptions(), {}, microfacet=microfacet)  # type: ignore[list-item]
+    [found] = fitted_objects([maps], [fit], FitOptions(), {}, said={}, microfacet=microfacet)  # type: ignore[list-item]
     return found
 
 

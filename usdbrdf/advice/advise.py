@@ -244,6 +244,8 @@ def _wanted(atlas: AssetMaps, fits: Sequence[FittedObject]) -> list[int]:
         own = atlas.texels.of_object(i)
         if own.stop == own.start or fit.status == "measured" or fit.directive in _LEFT_OUT:
             continue
+        if fit.is_glass:
+            continue
         if atlas.emissive[own].mean() > _LAMP:
             continue
         wanted.append(i)

@@ -368,7 +368,7 @@ class FittedObject(MeasuredObject):
         tokens=("paper", "microfacet", "beckmann"))] = "paper"
     kind: Annotated[str, Fact(FIT, "kind", "token", "dielectric", """dielectric: a diffuse colour
         under a lobe; conductor: a metal, a lobe alone whose reflectance differs by channel;
-        transparent: clear glass, by directive alone, which was not fitted.""",
+        transparent: clear glass, not fitted, by directive or as the outside shows through it.""",
         tokens=("dielectric", "conductor", "transparent"))] = "dielectric"
     directive: Annotated[str, Fact(FIT, "directive", "token", "", """What a person asked of the fit,
         in review.usda or in the capture's objects, and it followed. ignore: nothing was fitted;

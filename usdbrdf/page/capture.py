@@ -170,6 +170,8 @@ def findings(
         )
     if left := count.get("told"):
         told.append(f"{left} {'was' if left == 1 else 'were'} not fitted, by directive.")
+    if panes := count.get("pane"):
+        told.append(f"{panes} {'is a pane' if panes == 1 else 'are panes'} before the outside.")
     if failed := count.get("failed"):
         told.append(
             f"The fit of {failed} failed: {'its' if failed == 1 else 'their'} photographs do not "

@@ -160,6 +160,8 @@ def why(
     """
     if directive := _by_directive(fit, shading):
         return directive
+    if fit.is_glass:
+        return "Photographs show the outside through it: it is clear glass, and nothing was fitted."
     if status == "lamp":
         known = shading.radiance_status if shading else "measured"
         if known == "measured":
@@ -198,14 +200,16 @@ def why(
 
 def undetermined_because(fit: FittedObject | None, status: str, *, in_sight: bool = False) -> str:
     """One word about why the numbers of an object are not known: "told" where a person said that
-    nothing be fitted, "contradicted", "sparse" where too little was seen, "glimpsed" where an
-    object that counts as unseen lies ``in_sight`` of a camera; else ``status``."""
+    nothing be fitted, "pane", "contradicted", "sparse" where too little was seen, "glimpsed" where
+    an object that counts as unseen lies ``in_sight`` of a camera; else ``status``."""
     if status == "unseen" and in_sight:
         return "glimpsed"
     if fit is None or status != "prior":
         return status
     if fit.directive in ("ignore", "glass"):
         return "told"
+    if fit.is_glass:
+        return "pane"
     if fit.is_contradicted:
         return "contradicted"
     return "sparse" if math.isnan(fit.evidence) else status

@@ -20,7 +20,7 @@ from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.job.units import HERE, Workers
 from usdbrdf.material.fit_objects import Lighting, fitted_by_likelier_lobe, survey_frames
 from usdbrdf.material.refine import frame_reader
-from usdbrdf.model.mesh import LEFT_OUT, OF_FIT
+from usdbrdf.model.mesh import GLASS, LEFT_OUT, OF_FIT
 from usdbrdf.options import FitOptions, kind_of_light
 from usdbrdf.tasks.refined import fitted_objects, refined_objects
 from usdbrdf.tasks.task import Task, warned
@@ -79,7 +79,9 @@ def fit(asset: Asset, options: FitOptions, workers: Workers = HERE) -> TaskResul
 
     def work(run: TaskRun) -> dict[str, Any]:
         words = by_number(asked, maps[0].scene.objects)
-        left_out = [i for i, word in words.items() if word in LEFT_OUT]
+        # Through which the outside shows is clear glass, unless a person says otherwise.
+        wanted = dict.fromkeys((i for own in maps for i in own.surface.panes), GLASS) | words
+        left_out = [i for i, word in wanted.items() if word in LEFT_OUT]
         fitted = ~np.isin(maps[0].texels.object_index(), left_out)
         lit = [own.lit_scene(own.environment(options.environment)) for own in maps]
         reader = frame_reader(lit, maps[0].all_frames, options.memory)
@@ -99,8 +101,8 @@ def fit(asset: Asset, options: FitOptions, workers: Workers = HERE) -> TaskResul
             )
             for own, scene in zip(maps, lit, strict=True)
         ]
-        lobe, found = fitted_by_likelier_lobe(run, lightings, reader, options, words)
-        objects = fitted_objects(maps, found, options, words, microfacet=lobe != PAPER)
+        lobe, found = fitted_by_likelier_lobe(run, lightings, reader, options, wanted)
+        objects = fitted_objects(maps, found, options, wanted, said=words, microfacet=lobe != PAPER)
         measured = sum(item.status == "measured" for item in objects)
         say(f"fit: {measured} of {len(objects)} objects measured")
         if options.method == "views":

@@ -29,16 +29,18 @@ def fitted_objects(
     maps: Sequence[AssetMaps],
     found: Sequence[ObjectFit],
     options: FitOptions,
-    asked: Mapping[int, str],
+    wanted: Mapping[int, str],
     *,
+    said: Mapping[int, str],
     microfacet: bool,
 ) -> list[FittedObject]:
-    """What is published of each object's fit; ``asked``: what a person wants of some, by number."""
+    """What is published of each object's fit; ``wanted``: what some were taken for beforehand, by
+    number; ``said``: that of a person."""
     mapping = MICROFACET if microfacet and options.mapping == "matched" else options.mapping
     objects = []
     for i, (obj, own) in enumerate(zip(maps[0].scene.objects, found, strict=True)):
-        word, observed = asked.get(i, ""), any(some.is_observed(i) for some in maps)
-        judgement = judged(own, obj, options, observed, word)
+        observed = any(some.is_observed(i) for some in maps)
+        judgement = judged(own, obj, options, observed, wanted.get(i, ""))
         # A metal's numbers are of the facets of renderers.
         lobe = BECKMANN_FACETS if own.beckmann and judgement.kind == "dielectric" else MICROFACET
         objects.append(
@@ -53,7 +55,7 @@ def fitted_objects(
                 method=options.method,
                 mapping=mapping,
                 lobe=lobe if microfacet else "paper",
-                directive=word,
+                directive=said.get(i, ""),
                 **vars(judgement),
             )
         )

@@ -49,7 +49,8 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
         said = {i: word == LAMP for i, word in by_number(asked, maps.scene.objects).items()}
         surface = with_panes(run, maps, task.header.up_axis, said)
         outside = outside_of(run, maps, surface, options, task.header.up_axis, said)
-        given = surface, maps.lit, maps.coverage, maps.frames, outside
+        # Where nothing is outside, what panes show is all that is known of the light behind them.
+        given = surface if outside else maps.surface, maps.lit, maps.coverage, maps.frames, outside
         shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said)
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
