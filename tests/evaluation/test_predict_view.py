@@ -17,6 +17,7 @@ from usdbrdf.evaluation.evaluate_views import (
 )
 from usdbrdf.files.colour import to_display_srgb
 from usdbrdf.options import EvaluateOptions
+from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.surface_texture import surface_texture
 
 SIZE = (40, 30)
@@ -120,3 +121,31 @@ def test_a_reduced_view_is_a_mean_as_its_photograph_is(room, seen):
         off += np.abs(view.shown["baseline"] - view.reference)[view.counted].mean()
         point_off += np.abs(point - view.reference)[view.counted].mean()
     assert off < 0.6 * point_off
+
+
+def test_through_panes_the_full_model_shows_what_is_behind_them(seen):
+    labels = [obj.label for obj in seen.lit.scene.objects]
+    image = np.random.default_rng(3).uniform(5, 9, (16, 32, 3)).astype(np.float32)
+    lit = replace(seen.lit, environment=Environment(image, True))
+    unknown = replace(seen, lit=lit, phi=np.full_like(seen.phi, np.nan))
+    plain = predict_view(unknown, CAMERA, QUICK, 0)
+    face = lit.rays.closest(*CAMERA.rays(CAMERA.pixels())).face
+    owner = lit.owner(face).reshape(SIZE[::-1])
+    box, walls = labels.index("box"), labels.index("walls")
+
+    clear = replace(unknown, lit=replace(lit, panes=(box,)))
+    picture = predict_view(clear, CAMERA, QUICK, 0)
+    # As in a world without it; all else stays, and so does the baseline.
+    absent = replace(unknown, lit=replace(lit, rays=clear.lit.light_rays))
+    behind = predict_view(absent, CAMERA, QUICK, 0)
+    assert (owner == box).sum() > 20
+    np.testing.assert_allclose(picture.full[owner == box], behind.baseline[owner == box], rtol=1e-4)
+    assert np.abs(picture.full - plain.full)[owner == box].max() > 0.1
+    np.testing.assert_array_equal(picture.full[owner != box], plain.full[owner != box])
+    np.testing.assert_array_equal(picture.baseline, plain.baseline)
+
+    # What is past all walls is the sky, which is no hole of the scan.
+    picture = predict_view(replace(unknown, lit=replace(lit, panes=(walls,))), CAMERA, QUICK, 0)
+    assert (owner == walls).sum() > 100
+    assert picture.full[owner == walls].min() >= 5
+    assert picture.surface.all() == plain.surface.all()

@@ -37,9 +37,9 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import EvaluateOptions, Surroundings
 from usdbrdf.transport.brdf import DIELECTRIC, PAPER
-from usdbrdf.transport.environment import unknown_primaries
+from usdbrdf.transport.environment import radiance_from, unknown_primaries
 from usdbrdf.transport.let_through import share_let_through
-from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, visible_points
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, past_panes, visible_points
 from usdbrdf.transport.lobe_radiance import lobe_radiance
 from usdbrdf.transport.surface_texture import SurfaceTexture
 
@@ -334,13 +334,18 @@ def _radiance_at(
     seen: ViewedAsset, points: SurfacePoints, rays: int, per_pixel: int, seed: int
 ) -> Float:
     """(R, 8): baseline, full, 1 on the surface, 1 on an emitter; ``points`` pixel after pixel."""
+    values = np.zeros((len(points.face), 8), np.float32)
+    values[:, :3] = seen.measured.at(points.face, points.u, points.v)
+    values[:, 6] = points.face >= 0
+    first, points = points, past_panes(seen.lit, points)
+    outside = (first.face >= 0) & (points.face < 0)
     hit = points.face >= 0
     place = points.face, points.u, points.v
     lamp = hit & seen.lit.emits(points)
-    values = np.zeros((len(hit), 8), np.float32)
-    values[:, :3] = seen.measured.at(*place)
-    values[:, 3:6] = np.where(lamp[:, None], values[:, :3], seen.diffuse.at(*place))
-    values[:, 6], values[:, 7] = hit, lamp
+    shines = np.where((points.face == first.face)[:, None], values[:, :3], seen.measured.at(*place))
+    values[:, 3:6] = np.where(lamp[:, None], shines, seen.diffuse.at(*place))
+    values[outside, 3:6] = radiance_from(seen.lit.environment, -points.to_camera[outside])
+    values[:, 7] = lamp
     owner = seen.lit.owner(points.face)
     known = np.isfinite(seen.phi) & np.isfinite(seen.psi).all(axis=1)
     reflects = np.flatnonzero(hit & ~lamp & known[owner])

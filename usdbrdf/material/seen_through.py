@@ -16,7 +16,7 @@ import numpy as np
 from usdbrdf.material.verdict import LobeEstimate
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Float
-from usdbrdf.transport.environment import pixels_of_directions
+from usdbrdf.transport.environment import radiance_from
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
 from usdbrdf.transport.rays import lift_from_surface
 
@@ -56,19 +56,11 @@ def radiance_behind(lit: LitScene, points: SurfacePoints, index: int) -> Float:
         beyond = left[~own]
         behind[beyond] = lit.radiance.at(hits.face[~own], hits.u[~own], hits.v[~own])
         missed = beyond[hits.face[~own] < 0]
-        behind[missed] = _surroundings(lit, direction[missed])
+        behind[missed] = radiance_from(lit.environment, direction[missed])
         reached = origin[own] + direction[left[own]] * hits.distance[own, None]
         left = left[own]
         origin = lift_from_surface(reached, direction[left], lit.diagonal_m)
     return behind
-
-
-def _surroundings(lit: LitScene, direction: Float) -> Float:
-    picture = lit.environment.image
-    height, width = picture.shape[:2]
-    where = pixels_of_directions(direction, height, width, lit.environment.z_up)
-    found: Float = picture.reshape(-1, 3)[where]
-    return found
 
 
 def seen_through(

@@ -87,6 +87,15 @@ def pixels_of_directions(directions: Float, height: int, width: int, z_up: bool)
     return np.asarray(place, np.int64)
 
 
+def radiance_from(environment: Environment, directions: Float) -> Float:
+    """(R, 3) W/(m^2 sr): of the picture, without the sun, in each direction (R, 3)."""
+    picture = environment.image
+    height, width = picture.shape[:2]
+    where = pixels_of_directions(directions, height, width, environment.z_up)
+    found: Float = picture.reshape(-1, 3)[where]
+    return found
+
+
 def solid_angles(height: int, width: int) -> Double:
     """(H,) steradians of a pixel in each row."""
     edges = np.sin((0.5 - np.arange(height + 1) / height) * np.pi)

@@ -4,7 +4,7 @@ its light, a frame of it, and the surface points under its pixels."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -128,6 +128,20 @@ def points_of_rays(lit: TexturedScene, origins: Float, directions: Float) -> Sur
     normal = np.where(towards[:, None], -normal, normal).astype(np.float32)
     position = position.astype(np.float32)
     return SurfacePoints(hits.face, hits.u, hits.v, position, normal, -directions)
+
+
+def past_panes(lit: TexturedScene, points: SurfacePoints) -> SurfacePoints:
+    """What rays meet that pass panes, with the other points (R,) as they are."""
+    passes = (points.face >= 0) & np.isin(lit.owner(points.face), lit.panes)
+    if not passes.any():
+        return points
+    towards = -points.to_camera[passes]
+    without = replace(lit, rays=lit.light_rays, panes=())
+    behind = points_of_rays(without, points.position[passes], towards)
+    found = SurfacePoints._make(values.copy() for values in points)
+    for values, some in zip(found, behind, strict=True):
+        values[passes] = some
+    return found
 
 
 def points_of_texels(texels: Texels, index: Long, eye: Double) -> SurfacePoints:
