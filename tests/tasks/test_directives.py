@@ -105,8 +105,9 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
 
 def test_panes_are_clear_glass_unless_a_person_says_otherwise(tmp_path, monkeypatch):
     """How they are known is tested where that is done; without an outside they are surfaces."""
-    monkeypatch.setattr(outside, "find_panes", lambda *_: (capture.names.index("walls"),))
+    monkeypatch.setattr(outside, "find_panes", lambda *_: tuple(map(capture.names.index, panes)))
     capture = make_capture(tmp_path / "scan", subdivisions=2, poses=poses_down_and_up(6, 4))
+    panes = ["walls"]
     sky = tmp_path / "sky.exr"
     write_exr(sky, np.ones((8, 16, 3), np.float32))
     folder = tmp_path / "room"
@@ -130,6 +131,15 @@ def test_panes_are_clear_glass_unless_a_person_says_otherwise(tmp_path, monkeypa
     assert (fitted.kind, fitted.directive, fitted.num_pixels) == ("transparent", "", 0)
     rendered = render_scene_from_stage(stage, time_code(stage, None), lambda _: None)
     assert [s.name for s in rendered.surfaces if s.material.clear] == ["/room/geo/walls/walls"]
+    # One that is brighter than what reaches it is no lamp: the sky behind it is.
+    panes.append("lamp")
+    path = "/room/geo/lamp/lamp"
+    stage = found(replace(of_shade, sampling=replace(of_shade.sampling, seed=1)))[0]
+    shaded = read_shading(stage, path)
+    assert (shaded.lets_through, shaded.emitter) == (True, False)
+    assert not any(aov.name in ("emission", "unexplained") for aov in shaded.aovs)
+    assert read_fit(stage, path).is_glass
+    panes.remove("lamp")
     # The floor, which the walls' light reached alone, is lit by the sky as well.
     lit_by_sky = read_shading(stage, "/room/geo/floor/floor").escaped_fraction
     assert lit_by_sky > 0.05

@@ -451,15 +451,16 @@ def shade_surface(
     said     of objects, by number, whether they are lamps, where a person says so
     """
     environment = outside.environment if outside else black_environment()
-    panes, dark = surface.of_panes()[:, None], dict.fromkeys(surface.panes, False)
-    sent = *beside_panes(surface, lit, coverage), frames, outside, sampling.seed, dict(said) | dark
+    # What panes show is sent by what is behind them: they are no lamps, whatever their radiance.
+    said, panes = {**said, **dict.fromkeys(surface.panes, False)}, surface.of_panes()
+    sent = *beside_panes(surface, lit, coverage), frames, outside, sampling.seed, said
     light, unseen = _light(run, surface, *sent)
     filtered = lightmap_filter == OIDN
     if filtered:
         sampling = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)
     traced = trace_irradiance(run, surface, light.lit, environment, sampling)
     irradiance = denoised_irradiance(surface.texels, traced.mean) if filtered else traced.mean
-    light = replace(light, lit=np.where(panes, lit, light.lit))
+    light = replace(light, lit=np.where(panes[:, None], lit, light.lit))
     texels, seen = surface.texels, coverage.measured
     may_shine = light.may_shine(coverage.clipped)
     doubt = _doubt(texels, light, unseen, outside, seen, irradiance)
@@ -469,12 +470,12 @@ def shade_surface(
     )
     told = coverage.tells_albedo
     albedo, over = albedo_map(texels, light.lit, irradiance, told, emitters.emissive)
-    over &= seen
+    over &= seen & ~panes
     level = np.maximum(traced.mean.mean(axis=1), 1e-30)
     relative = np.sqrt((traced.standard_error**2).mean(axis=1)) / level
     return Shaded(
         measured=coverage.measured, light=light, traced=traced, relative_error=relative,
         irradiance=irradiance, unseen=unseen, emitters=emitters, albedo=albedo, unexplained=over,
         outside=outside, panes=surface.panes,
-        over_one=float(over.sum() / max((seen & ~emitters.emissive).sum(), 1)),
+        over_one=float(over.sum() / max((seen & ~panes & ~emitters.emissive).sum(), 1)),
     )  # fmt: skip
