@@ -116,8 +116,8 @@ def test_the_bytes_are_the_same_though_workers_die_and_hang(
 ) -> None:
     chosen = ClusterOptions(workers=2, unit_limit=4)
     with workers_of(chosen) as workers:
-        # The first six are no units: light that is found in this process.
-        strike(monkeypatch, 7, lambda: os.kill(workers_on_this_machine()[0], signal.SIGKILL))
+        # The first seven are no units: panes and light that is found in this process.
+        strike(monkeypatch, 8, lambda: os.kill(workers_on_this_machine()[0], signal.SIGKILL))
         pipeline.shade(copy, SHADE, workers)
         assert all(
             connection.laddr.ip == "127.0.0.1"
@@ -235,7 +235,7 @@ def test_without_its_scheduler_a_run_ends_in_a_sentence_and_goes_on_from_there(
     copy: Asset, alone: dict[str, str], cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address, start = cluster
-    # The first six are no units: light that is found in this process.
+    # The first seven are no units: panes and light that is found in this process.
     strike(monkeypatch, 8, start().kill)
     with (
         workers_of(ClusterOptions(scheduler=address)) as workers,
@@ -268,7 +268,7 @@ def test_a_scheduler_that_is_started_anew_meanwhile_changes_no_byte(
         first.wait()
         second.append(start().pid)
 
-    # The first six are no units: light that is found in this process.
+    # The first seven are no units: panes and light that is found in this process.
     strike(monkeypatch, 8, renew)
     chosen = ClusterOptions(scheduler=address)
     failures: list[str] = []

@@ -211,9 +211,9 @@ def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls, resum
     tiles = calls["irradiance_at"]
     assert tiles > 6
     shutil.rmtree(asset)
-    # The first checkpoints are the light from outside, of hidden surfaces and of lamps that no
+    # The first checkpoints are panes, the light from outside, of hidden surfaces and of lamps that no
     # frame shows, both twice, and of hidden surfaces in the light of all lamps.
-    assert resumed("shade", "checkpoint:9") == {"irradiance_at": tiles - 3}
+    assert resumed("shade", "checkpoint:10") == {"irradiance_at": tiles - 3}
 
 
 def test_fitting_fits_only_the_objects_that_are_missing(resumed):
