@@ -211,8 +211,8 @@ def test_shading_traces_only_the_tiles_that_are_missing(base, case, calls, resum
     tiles = calls["irradiance_at"]
     assert tiles > 6
     shutil.rmtree(asset)
-    # The first checkpoints are panes, the light from outside, of hidden surfaces and of lamps that no
-    # frame shows, both twice, and of hidden surfaces in the light of all lamps.
+    # The first checkpoints are panes, the light from outside, of hidden surfaces and of lamps that
+    # no frame shows, both twice, and of hidden surfaces in the light of all lamps.
     assert resumed("shade", "checkpoint:10") == {"irradiance_at": tiles - 3}
 
 
