@@ -11,12 +11,14 @@ from tests.physics.surfaces import quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.files.images import write_exr
 from usdbrdf.job.task import TaskRun
+from usdbrdf.material.refined_irradiance import Lobes, let_through_surfaces, refined_irradiance
 from usdbrdf.model.texels import Coverage, CoverageMap
 from usdbrdf.shading.asked import Shining, irradiance_of_texels
 from usdbrdf.shading.panes import beside_panes, find_panes, what_shows_through
 from usdbrdf.shading.surroundings import surroundings_from_frames
-from usdbrdf.transport.environment import Environment, directions_of_pixels
-from usdbrdf.transport.lit_scene import TexturedScene
+from usdbrdf.transport.brdf import DIELECTRIC
+from usdbrdf.transport.environment import Environment, black_environment, directions_of_pixels
+from usdbrdf.transport.lit_scene import TexturedScene, lit_scene
 
 FLOOR, CEILING, PANE = 0, 1, 2
 HEIGHT = 0.6  # of the pane, metres
@@ -147,3 +149,26 @@ def test_light_passes_a_pane_as_if_it_was_not_there():
     assert np.median(error) < 0.02
     assert passed.sum() == pytest.approx(bare.sum(), rel=0.005)
     assert opaque.sum() < 0.7 * bare.sum()
+
+
+def test_panes_are_no_lights_whatever_they_are_taken_to_send(tmp_path):
+    """What hides is taken to reflect the sky above it, and refining is told what frames saw."""
+    floor = quad((-2, -2, 0), (4, 0, 0), (0, 4, 0), (24, 24))
+    pane = quad((-0.7, -0.7, 0.5), (0, 1.4, 0), (1.4, 0, 0), (8, 8))
+    world, index = world_of([floor, pane]), np.arange(24 * 24)
+    shown = np.zeros((len(world.texels), 3), np.float32)
+    shown[24 * 24 :] = 9.0
+    lobes = Lobes(np.full(2, 0.3, np.float32), np.full((2, 3), 0.3, np.float32), np.zeros(2, bool))
+
+    def received(panes):
+        surface = TexturedScene(world.scene, world.texels, world.rays, panes)
+        dark, run = black_environment(), TaskRun(tmp_path, "fit", tmp_path / f"work{len(panes)}")
+        lit = lit_scene(surface, 0 * shown, np.zeros(len(shown), np.bool_), dark)
+        lit = replace(lit, lobe=DIELECTRIC)
+        traced = irradiance_of_texels(surface, Shining.of(surface, shown, dark), dark, index, 1)
+        refined = refined_irradiance(run, lit, 0 * shown, shown, lobes, "none", 0)
+        through = let_through_surfaces(run, lit, shown, lobes, 0)
+        return [np.abs(one[index]).sum() for one in (traced, refined, through)]
+
+    assert min(received(())) > 0
+    assert max(received((1,))) == 0

@@ -21,7 +21,7 @@ from usdbrdf.transport.denoise import OIDN
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import ByAngle, irradiance_at
 from usdbrdf.transport.let_through import share_let_through, table_let_through
-from usdbrdf.transport.lights import Lights, lights_from_radiance
+from usdbrdf.transport.lights import Lights
 from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.lobe_radiance import specular_irradiance
 from usdbrdf.transport.sunlight import sunlight
@@ -87,7 +87,7 @@ def refined_irradiance(
     other by ``change`` (T, 3), W/(m^2 sr), and the lobes are light as well."""
     texels, seed = lit.texels, seed ^ _SEED
     texture = lit.radiance.showing(texels, change)
-    lights = lights_from_radiance(lit.scene, texels, np.abs(change))
+    lights = lit.lights_of(np.abs(change))
     sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed)
 
     given = _Change(lit, texture, lights, lobes, sampling)
@@ -142,7 +142,7 @@ def let_through_surfaces(
     given = _Scattering(
         lit,
         lit.radiance.showing(texels, light),
-        lights_from_radiance(lit.scene, texels, light, outside=(lit.light_rays, lit.environment)),
+        lit.lights_of(light, lit.environment),
         lobes,
         Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed ^ _SEED),
         table_let_through(lobes.phi, lobes.psi) - 1,

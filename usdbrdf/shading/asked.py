@@ -13,7 +13,7 @@ from usdbrdf.options import Sampling
 from usdbrdf.shading.outside_light import Asked
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.irradiance import independent_tiles, irradiance_at
-from usdbrdf.transport.lights import Lights, lights_from_radiance
+from usdbrdf.transport.lights import Lights
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.rays import lift_from_surface
 from usdbrdf.transport.sunlight import sunlight
@@ -80,9 +80,7 @@ class Shining(NamedTuple):
         cls, surface: TexturedScene, light: Float, environment: Environment | None = None
     ) -> Shining:
         """light (T, 3), W/(m^2 sr); environment: what shines in from outside, if it counts."""
-        outside = (surface.light_rays, environment) if environment else None
-        lights = lights_from_radiance(surface.scene, surface.texels, light, outside=outside)
-        return cls(surface.texture(light), lights)
+        return cls(surface.texture(light), surface.lights_of(light, environment))
 
 
 def irradiance_of_texels(

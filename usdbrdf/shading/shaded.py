@@ -31,7 +31,7 @@ from usdbrdf.texturing.inpaint import telling
 from usdbrdf.transport.denoise import OIDN, denoise_lightmaps
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.irradiance import Irradiance, irradiance_at, tiles_of_texels, whole_tiles
-from usdbrdf.transport.lights import Lights, lights_from_radiance
+from usdbrdf.transport.lights import Lights
 from usdbrdf.transport.lit_scene import TexturedScene
 from usdbrdf.transport.sunlight import sunlight
 from usdbrdf.transport.surface_texture import SurfaceTexture
@@ -193,8 +193,7 @@ def trace_irradiance(
 ) -> Irradiance:
     """S at all texels with the radiance ``lit`` (T, 3) as the light."""
     texels = surface.texels
-    radiance, outside = surface.texture(lit), (surface.light_rays, environment)
-    lights = lights_from_radiance(surface.scene, texels, lit, outside=outside)
+    radiance, lights = surface.texture(lit), surface.lights_of(lit, environment)
     # In less light than this the texel's albedo would be over 1 and is not to be had: lamps, and
     # surfaces lit from outside the scan.
     dark = np.pi * lit.mean(axis=1)

@@ -36,7 +36,7 @@ from usdbrdf.transport.surface_texture import unsigned
 
 # Surface brighter than this many times the scene's area-mean radiance is worth its own rays; the
 # cosine-distributed ones find everything dimmer well enough.
-_BRIGHTER_THAN = 3.0
+BRIGHTER_THAN = 3.0
 # Groups at most; steps of a tile's guide per group: picking then seldom has to look further; share
 # of the picks that follow power alone; and texels of a tile that its groups are weighed at.
 _GROUPS, _STEPS, _BY_POWER, _WEIGHED_AT = 512, 4, 0.1, 8
@@ -146,7 +146,7 @@ def lights_from_radiance(
     scene: Scene,
     texels: Texels,
     radiance: Float,
-    brighter_than: float = _BRIGHTER_THAN,
+    brighter_than: float = BRIGHTER_THAN,
     outside: tuple[RayScene, Environment] | None = None,
 ) -> Lights:
     """Triangles whose mean L_d is ``brighter_than`` so many times the scene's area mean, picked in

@@ -17,7 +17,7 @@ from usdbrdf.model.scene import Scene
 from usdbrdf.model.texels import Texels
 from usdbrdf.transport.brdf import BECKMANN, CONDUCTOR, DIELECTRIC, PAPER
 from usdbrdf.transport.environment import Environment
-from usdbrdf.transport.lights import Lights, lights_from_radiance
+from usdbrdf.transport.lights import BRIGHTER_THAN, Lights, lights_from_radiance
 from usdbrdf.transport.rays import Hits, RayScene
 from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 
@@ -46,6 +46,15 @@ class TexturedScene:
     def of_panes(self) -> Bool:
         """(T,): the texel is a pane's."""
         return np.asarray(np.isin(self.texels.object_index(), self.panes), np.bool_)
+
+    def lights_of(
+        self, light: Float, outside: Environment | None = None, brighter_than: float = BRIGHTER_THAN
+    ) -> Lights:
+        """What rays are sent to where surfaces send ``light`` (T, 3), W/(m^2 sr), and panes none:
+        rays pass them, and would bring both it and what is behind them."""
+        sent = np.where(self.of_panes()[:, None], np.float32(0), light)
+        openings = (self.light_rays, outside) if outside else None
+        return lights_from_radiance(self.scene, self.texels, sent, brighter_than, openings)
 
     @cached_property
     def diagonal_m(self) -> float:
@@ -165,13 +174,7 @@ def lit_scene(
         rays=surface.rays,
         panes=surface.panes,
         radiance=radiance,
-        lights=lights_from_radiance(
-            surface.scene,
-            surface.texels,
-            np.where(surface.of_panes()[:, None], np.float32(0), light),
-            _BRIGHTER_THAN,
-            (surface.light_rays, environment),
-        ),
+        lights=surface.lights_of(light, environment, _BRIGHTER_THAN),
         emission=radiance.showing(surface.texels, shines),
         environment=environment,
     )
