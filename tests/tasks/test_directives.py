@@ -21,6 +21,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.images import write_exr
 from usdbrdf.model.mesh import OF_FIT
 from usdbrdf.tasks import outside
+from usdbrdf.tasks.shade import shade
 from usdbrdf.validation.validate import has_errors, validate
 
 OPTIONS = usdbrdf.ConvertOptions(
@@ -148,6 +149,24 @@ def test_panes_are_clear_glass_unless_a_person_says_otherwise(tmp_path, monkeypa
     stage, shaded, fitted = found(OPTIONS.shade)
     assert (shaded.lets_through, fitted.kind) == (False, "dielectric")
     assert read_shading(stage, "/room/geo/floor/floor").escaped_fraction < lit_by_sky
+
+
+def test_panes_are_asked_of_photographs_that_are_those_of_the_capture(tmp_path):
+    """Where something is outside; without, the photographs may be gone."""
+    capture = make_capture(tmp_path / "scan", subdivisions=1, poses=poses_down_and_up(5, 4))
+    sky = tmp_path / "sky.exr"
+    write_exr(sky, np.ones((8, 16, 3), np.float32))
+    folder = tmp_path / "room"
+    usdbrdf.convert(capture.folder, folder, OPTIONS)
+    asset = Asset.made(folder)
+    for file in capture.folder.glob("frames/*.exr"):
+        write_exr(file, np.ones((24, 32, 3), np.float32))
+    with pytest.raises(InputRefused, match=r"\[input.changed\]$"):
+        shade(asset, replace(OPTIONS.shade, environment=sky))
+    for file in capture.folder.glob("frames/*.exr"):
+        file.unlink()
+    sampling = replace(OPTIONS.shade.sampling, seed=5)
+    shade(asset, replace(OPTIONS.shade, sampling=sampling))
 
 
 def test_a_word_that_is_none_stops_the_step_that_reads_it(built):

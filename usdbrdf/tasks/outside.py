@@ -21,9 +21,12 @@ from usdbrdf.transport.lit_scene import TexturedScene
 
 
 def with_panes(
-    run: TaskRun, maps: AssetMaps, up_axis: str, said: Mapping[int, bool]
+    run: TaskRun, maps: AssetMaps, options: ShadeOptions, up_axis: str, said: Mapping[int, bool]
 ) -> TexturedScene:
-    """The scene with the panes that the capture shows; what a person calls a lamp is none."""
+    """The scene with the panes that the capture shows, none where nothing is to be outside; what a
+    person calls a lamp is none."""
+    if options.environment == NO_LIGHT:
+        return maps.surface
     found = find_panes(run, maps.surface, maps.lit, maps.coverage, maps.frames, up_axis == "Z")
     return replace(maps.surface, panes=tuple(i for i in found if not said.get(i)))
 

@@ -19,7 +19,7 @@ from usdbrdf.asset.readers.compose import hashes_of_inputs, open_weaker
 from usdbrdf.job.task import TaskResult, TaskRun
 from usdbrdf.job.units import HERE, Workers
 from usdbrdf.model.mesh import LAMP, OF_SHADE
-from usdbrdf.options import ESTIMATE, ShadeOptions, kind_of_light
+from usdbrdf.options import NO_LIGHT, ShadeOptions, kind_of_light
 from usdbrdf.shading.lamp_shapes import shapes_of_object
 from usdbrdf.shading.shaded import Shaded, shade_surface
 from usdbrdf.tasks.outside import outside_of, with_panes, write_outside
@@ -35,7 +35,7 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
     asked = directives_of(asset, maps.stage, OF_SHADE)
     inputs = hashes_of_inputs(
         asset, "shading", maps, aovs=("lit", "coverage"), environment=options.environment,
-        photographs=options.environment == ESTIMATE,
+        photographs=options.environment != NO_LIGHT,
     )  # fmt: skip
     parameters = {
         **asdict(options.sampling),
@@ -47,7 +47,7 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
 
     def work(run: TaskRun) -> dict[str, Any]:
         said = {i: word == LAMP for i, word in by_number(asked, maps.scene.objects).items()}
-        surface = with_panes(run, maps, task.header.up_axis, said)
+        surface = with_panes(run, maps, options, task.header.up_axis, said)
         outside = outside_of(run, maps, surface, options, task.header.up_axis, said)
         # Where nothing is outside, what panes show is all that is known of the light behind them.
         given = surface if outside else maps.surface, maps.lit, maps.coverage, maps.frames, outside
