@@ -133,7 +133,7 @@ def test_through_panes_the_full_model_shows_what_is_behind_them(seen):
     owner = lit.owner(face).reshape(SIZE[::-1])
     box, walls = labels.index("box"), labels.index("walls")
 
-    clear = replace(unknown, lit=replace(lit, panes=(box,)))
+    clear = replace(unknown, lit=replace(lit, panes=(box,)), shown=())
     picture = predict_view(clear, CAMERA, QUICK, 0)
     # As in a world without it; all else stays, and so does the baseline.
     absent = replace(unknown, lit=replace(lit, rays=clear.lit.light_rays))
@@ -144,8 +144,14 @@ def test_through_panes_the_full_model_shows_what_is_behind_them(seen):
     np.testing.assert_array_equal(picture.full[owner != box], plain.full[owner != box])
     np.testing.assert_array_equal(picture.baseline, plain.baseline)
 
+    # A person may say that it is a metal, and it is shown as renderers are told.
+    assert box in unknown.shown
+    picture = predict_view(replace(clear, shown=unknown.shown), CAMERA, QUICK, 0)
+    np.testing.assert_array_equal(picture.full, plain.full)
+
     # What is past all walls is the sky, which is no hole of the scan.
-    picture = predict_view(replace(unknown, lit=replace(lit, panes=(walls,))), CAMERA, QUICK, 0)
+    clear = replace(clear, lit=replace(lit, panes=(walls,)))
+    picture = predict_view(clear, CAMERA, QUICK, 0)
     assert (owner == walls).sum() > 100
     assert picture.full[owner == walls].min() >= 5
     assert picture.surface.all() == plain.surface.all()

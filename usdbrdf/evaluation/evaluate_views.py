@@ -253,13 +253,15 @@ def _write_pictures(folder: Path, view: ScoredView) -> None:
 @dataclass(frozen=True, kw_only=True)
 class ViewedAsset:
     """What is seen: the scene with its light; L_d, and L_d without specular light, on the surface;
-    the lobe of each object, phi (num_objects,) and psi (num_objects, 3), NaN for none."""
+    the lobe of each object, phi (num_objects,) and psi (num_objects, 3), NaN for none; and the
+    numbers of the objects whose material is no clear glass, though they may let light through."""
 
     lit: LitScene
     measured: SurfaceTexture
     diffuse: SurfaceTexture
     phi: Float
     psi: Float
+    shown: tuple[int, ...] = ()
 
 
 def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Surroundings) -> ViewedAsset:
@@ -287,6 +289,7 @@ def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Surroundings) -> V
         diffuse=lit.radiance.showing(atlas.texels, diffuse),
         phi=np.array([fit.phi for fit in fits], np.float32),
         psi=np.array([fit.psi_of_channels for fit in fits], np.float32),
+        shown=tuple(i for i, fit in enumerate(fits) if not fit.is_glass),
     )
 
 
@@ -337,7 +340,7 @@ def _radiance_at(
     values = np.zeros((len(points.face), 8), np.float32)
     values[:, :3] = seen.measured.at(points.face, points.u, points.v)
     values[:, 6] = points.face >= 0
-    first, points = points, past_panes(seen.lit, points)
+    first, points = points, past_panes(seen.lit, points, seen.shown)
     outside = (first.face >= 0) & (points.face < 0)
     hit = points.face >= 0
     place = points.face, points.u, points.v

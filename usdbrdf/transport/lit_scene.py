@@ -139,9 +139,12 @@ def points_of_rays(lit: TexturedScene, origins: Float, directions: Float) -> Sur
     return SurfacePoints(hits.face, hits.u, hits.v, position, normal, -directions)
 
 
-def past_panes(lit: TexturedScene, points: SurfacePoints) -> SurfacePoints:
-    """What rays meet that pass panes, with the other points (R,) as they are."""
-    passes = (points.face >= 0) & np.isin(lit.owner(points.face), lit.panes)
+def past_panes(
+    lit: TexturedScene, points: SurfacePoints, shown: Sequence[int] = ()
+) -> SurfacePoints:
+    """What rays meet that pass panes, with the other points (R,) as they are; ``shown``: numbers of
+    panes that count as surfaces where they are met first."""
+    passes = (points.face >= 0) & np.isin(lit.owner(points.face), np.setdiff1d(lit.panes, shown))
     if not passes.any():
         return points
     towards = -points.to_camera[passes]
