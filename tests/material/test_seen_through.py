@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,14 @@ def test_what_misses_everything_shows_the_surroundings():
     assert (found[up] == 7).all()
     assert (found[~up] <= 7).all()
     assert (found < 1).any()
+
+
+def test_past_panes_it_shows_the_surroundings(lit: LitScene):
+    """What frames saw on the panes is the mean over all directions."""
+    sky = Environment(np.full((2, 4, 3), 7.0, np.float32), z_up=True)
+    lit = replace(lit, environment=sky, panes=tuple(range(PANE)))
+    texel, _, eye = _views(_world(), PANE)
+    assert (radiance_behind(lit, points_of_texels(lit.texels, texel, eye), PANE) == 7).all()
 
 
 def _through(lit: LitScene, share: float, seed: int) -> Through:

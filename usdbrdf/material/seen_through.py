@@ -43,7 +43,8 @@ NOTHING = Through(0.0, math.inf)
 
 def radiance_behind(lit: LitScene, points: SurfacePoints, index: int) -> Float:
     """(R, 3) W/(m^2 sr): what the rays from the camera meet behind object ``index``, of which
-    ``points`` are; 0 where that is nothing, and nothing is known of the surroundings."""
+    ``points`` are, and past panes; 0 where that is nothing, and nothing is known of the
+    surroundings."""
     behind = np.zeros((len(points.face), 3), np.float32)
     direction = np.ascontiguousarray(-points.to_camera, np.float32)
     origin = lift_from_surface(points.position, direction, lit.diagonal_m)
@@ -51,7 +52,7 @@ def radiance_behind(lit: LitScene, points: SurfacePoints, index: int) -> Float:
     for _ in range(_MOST_LAYERS):
         if not len(left):
             break
-        hits = lit.rays.closest(origin, direction[left])
+        hits = lit.light_rays.closest(origin, direction[left])
         own = lit.owner(hits.face) == index
         beyond = left[~own]
         behind[beyond] = lit.radiance.at(hits.face[~own], hits.u[~own], hits.v[~own])
