@@ -14,6 +14,7 @@ from usdbrdf.capture.adapters import read_scan
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.colour import encoding_of_tag
 from usdbrdf.files.frames import PHOTOGRAPH_SATURATION, read_frame, read_recorded
+from usdbrdf.files.icc_profiles import space_of_profile
 from usdbrdf.files.images import colour_tag, read_radiance
 from usdbrdf.options import IngestOptions
 
@@ -179,6 +180,93 @@ def _profile(name: str) -> np.ndarray:
     head = head.ljust(36, b"\0") + b"acsp"
     head = head.ljust(68, b"\0") + struct.pack(">3I", 0xF6D6, 0x10000, 0xD32D)  # D50
     return np.frombuffer(head.ljust(128, b"\0") + table + description, np.uint8)
+
+
+# As Apple's Display P3, HP's sRGB and Adobe's RGB have them: XYZ of red, green and blue.
+P3 = ((0.51512, 0.2412, -0.00105), (0.29198, 0.69225, 0.04189), (0.1571, 0.06656, 0.78407))
+SRGB = ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.7141))
+ADOBE = ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457))
+PROPHOTO = ((0.79767, 0.28804, 0.0), (0.13519, 0.71188, 0.0), (0.03134, 0.00009, 0.82491))
+CURVES = {
+    "sRGB's formula": b"para" + bytes(4) + struct.pack(
+        ">HH5i", 3, 0,
+        *(round(x * 65536) for x in (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)),
+    ),
+    "sRGB's table": b"curv" + bytes(4) + struct.pack(
+        ">I1024H", 1024,
+        *(round(65535 * (x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4))
+          for x in np.linspace(0, 1, 1024)),
+    ),
+    "2.2": b"curv" + bytes(4) + struct.pack(">IHxx", 1, 0x233),
+    "2.2 as a formula": b"para" + bytes(4) + struct.pack(">HHi", 0, 0, round(2.2 * 65536)),
+    "none": b"curv" + bytes(8),
+}  # fmt: skip
+
+
+def _profile_of_numbers(columns, curve: str, name: str = "Anzeige P3", language: str = "deDE"):
+    """A whole profile of a display, as ICC.1:2022 lays it out."""
+    text = name.encode("utf-16-be")
+    described = b"mluc" + bytes(4) + struct.pack(">II4sII", 1, 12, language.encode(), len(text), 28)
+    tags = {b"desc": described + text}
+    for colour, place in zip(b"rgb", columns, strict=True):
+        numbers = struct.pack(">3i", *(round(x * 65536) for x in place))
+        tags[b"%cXYZ" % colour] = b"XYZ " + bytes(4) + numbers
+        tags[b"%cTRC" % colour] = CURVES[curve]
+    table, body = struct.pack(">I", len(tags)), b""
+    for tag, content in tags.items():
+        table += struct.pack(">4sII", tag, 132 + 12 * len(tags) + len(body), len(content))
+        body += content.ljust(-(-len(content) // 4) * 4, b"\0")
+    head = bytes(_profile("")[4:128])
+    head = head[:4] + struct.pack(">I", 0x04200000) + head[8:]
+    return struct.pack(">I", 132 + 12 * len(tags) + len(body)) + head + table + body
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+@pytest.mark.parametrize(
+    ("columns", "curve", "known"),
+    [(P3, "sRGB's formula", "srgb_p3d65_scene"), (PROPHOTO, "2.2", None)],
+)
+def test_a_profile_described_in_no_known_language_is_known_by_its_numbers(
+    tmp_path, suffix, columns, curve, known
+):
+    icc = np.frombuffer(_profile_of_numbers(columns, curve), np.uint8)
+    file = tmp_path / f"a{suffix}"
+    spec = oiio.ImageSpec(8, 8, 3, "uint8")
+    spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(icc)}]"), icc)
+    output = oiio.ImageOutput.create(str(file))
+    assert output.open(str(file), spec)
+    assert output.write_image(np.zeros((8, 8, 3), np.uint8))
+    assert output.close()
+    name, places = colour_tag(file)
+    assert encoding_of_tag(name, places) == known
+    assert known or name == "an ICC profile without a name"
+
+
+@pytest.mark.parametrize(
+    ("columns", "curve", "known"),
+    [
+        (P3, "sRGB's formula", "srgb_p3d65_scene"),
+        (P3, "sRGB's table", "srgb_p3d65_scene"),
+        (SRGB, "sRGB's table", "srgb_rec709_scene"),
+        (ADOBE, "2.2", "g22_adobergb_scene"),
+        (ADOBE, "2.2 as a formula", "g22_adobergb_scene"),
+        (SRGB, "2.2", ""),
+        (P3, "none", ""),
+        (PROPHOTO, "2.2", ""),
+    ],
+)
+def test_a_profile_is_known_by_primaries_and_curve(columns, curve, known):
+    assert space_of_profile(_profile_of_numbers(columns, curve, "sRGB", "enUS")) == known
+
+
+def test_what_is_no_whole_profile_is_of_no_space():
+    whole, random = _profile_of_numbers(P3, "sRGB's table"), np.random.default_rng(0)
+    last = whole.rfind(CURVES["sRGB's table"]) + len(CURVES["sRGB's table"])
+    assert all(space_of_profile(whole[:size]) == "" for size in range(0, last, 7))
+    for _ in range(500):
+        damaged = np.frombuffer(whole, np.uint8).copy()
+        damaged[random.integers(128, 400, 20)] = random.integers(0, 256, 20)
+        space_of_profile(damaged.tobytes())
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])

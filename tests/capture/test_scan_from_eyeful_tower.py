@@ -101,6 +101,11 @@ def _other_lens(capture):
         document["KRT"][3]["distortionModel"] = "Pinhole"
 
 
+def _no_terms(capture):
+    with edited(capture / "cameras.json") as document:
+        del document["KRT"][3]["distortion"]
+
+
 def _more_terms(capture):
     """A fisheye of six radial terms and two tangential ones, as Project Aria has it."""
     with edited(capture / "cameras.json") as document:
@@ -129,6 +134,7 @@ def _no_list(capture):
         (_no_mesh, r"no mesh\. Download mesh.obj.*--mesh\. \[mesh.missing\]"),
         (_no_pictures, r"no pictures below.*\[capture.frames\]"),
         (_other_lens, r"the lens of '1/1_REN0003' is 'Pinhole'.*\[capture.camera\]"),
+        (_no_terms, r"the lens of '1/1_REN0003' is 'RadialAndTangential', not.* with its terms"),
         (_more_terms, r"the lens of '1/1_REN0003' has more terms than its model Fisheye"),
         (_sixth_term, r"has more terms than its model RadialAndTangential.*\[capture.camera\]"),
         (_other_names, r"none of its 11 cameras has a picture in images-2k.*\[capture.frames\]"),

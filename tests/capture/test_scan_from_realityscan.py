@@ -251,12 +251,39 @@ def test_a_division_straightens_by_its_term(tmp_path, room, bent):
 @pytest.mark.parametrize(
     ("model", "terms"),
     [("division", "-0.1 0.02 0 0 0 0"), ("division", "-0,1 0 0"), ("brown3", "-0,1 0 0 0 0 0"),
-     ("brown3", "0 0 0 0 0 0 0.1"), ("brown3", "nan 0 0"), ("fisheye", "0.1 0 0")],
+     ("brown3", "0 0 0 0 0 0 0.1"), ("brown3", "nan 0 0"), ("fisheye", "0.1 0 0"),
+     # Where t1 stands is not known: the fourth of five may be it.
+     ("brown3t2", "-0.1 0.06 -0.01 0.002 0.001"), ("brown4t2", "-0.1 0.06 -0.01 0 0.001")],
 )  # fmt: skip
 def test_terms_that_nobody_knows_are_refused(tmp_path, room, model, terms):
     folder = _with_lens(write_sidecars(tmp_path / "scan", room, as_attributes=False), model, terms)
     with pytest.raises(InputRefused, match=rf"lens model '{model}' is not read with the terms"):
         read_scan(folder, OPTIONS)
+
+
+@pytest.mark.parametrize("terms", ["", "0 0 0", "-0.1 0 0"])
+def test_without_a_model_there_are_no_terms(tmp_path, room, terms):
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)
+    for file in folder.rglob("*.xmp"):
+        text = file.read_text().replace('xcr:DistortionModel="brown3" ', "")
+        file.write_text(text.replace(">0 0 0 0 0 0<", f">{terms}<"))
+    if "1" in terms:
+        with pytest.raises(InputRefused, match=r"the lens model '' is not read with the terms"):
+            read_scan(folder, OPTIONS)
+    else:
+        assert_same(read_scan(folder, OPTIONS), room)
+
+
+def test_of_a_division_without_its_picture_no_warning_counts_the_camera(tmp_path, room):
+    folder = write_sidecars(tmp_path / "scan", room, as_attributes=False)
+    first = min(folder.rglob("*.xmp"))
+    _with_lens(folder, "division", "-0.1")
+    next(p for p in first.parent.glob(f"{first.stem}.*") if p != first).unlink()
+    findings = Findings()
+    files = sorted(folder.rglob("*.xmp"))
+    records = list(records_of_sidecars(files, pictures_of(folder, OPTIONS), findings))
+    assert len(records) == len(files) - 1
+    assert any(f"the lens model of {len(records)} cameras" in said for said in findings.warnings)
 
 
 def test_terms_of_zero_may_be_left_out(tmp_path, room):

@@ -149,6 +149,42 @@ def test_a_store_that_never_answers_is_asked_three_times(
     assert not [*tmp_path.rglob("*.npy")]
 
 
+def test_uploads_behind_one_that_failed_do_not_wait_for_the_store_again(
+    silent: list[socket.socket], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor does this process at its end, for as often as the pool could be filled again."""
+    from fsspec.config import conf
+
+    monkeypatch.setitem(conf, "s3", {"config_kwargs": {"read_timeout": 0.2}})
+    monkeypatch.setattr(object_store, "_LONGEST_TRY", 0.0)
+    store = Store(files_at(f"s3://{BUCKET}/prefix", tmp_path / "ours"))
+
+    def keep_many() -> None:
+        for i in range(2 * object_store._WAITING):
+            store.keep(ARRAY[i:])
+
+    with pytest.raises(EnvironmentFailure, match="the object store failed"):
+        keep_many()
+    with pytest.raises(EnvironmentFailure, match="the object store failed"):
+        store.files.settle()
+    assert len(silent) == 3 * object_store._AT_ONCE
+
+
+@pytest.mark.parametrize("known_by", ["s3", "s3a"])
+def test_settings_of_a_user_count_by_either_name_of_the_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known_by: str
+) -> None:
+    pytest.importorskip("s3fs", reason="s3fs is not installed")
+    from fsspec.config import conf
+
+    monkeypatch.setitem(conf, known_by, {"config_kwargs": {"read_timeout": 77}})
+    for kind in ("s3", "s3a"):
+        files = files_at(f"{kind}://{BUCKET}/prefix", tmp_path)
+        assert isinstance(files, object_store.Objects)
+        assert files._system.config_kwargs["read_timeout"] == 77
+        assert files._system.config_kwargs["connect_timeout"] == 5
+
+
 def test_a_store_that_never_answers_is_said_within_a_minute(tmp_path: Path) -> None:
     pytest.importorskip("s3fs", reason="s3fs is not installed")
     files = files_at(f"s3://{BUCKET}/prefix", tmp_path)

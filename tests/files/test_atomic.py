@@ -351,6 +351,19 @@ def test_an_error_does_not_name_what_is_temporary(tmp_path):
         theirs.read_text()
 
 
+def test_a_rename_that_is_refused_names_what_was_to_be_replaced(tmp_path):
+    """As a task's finished files are called as those that they are to replace."""
+    staged, taken = tmp_path / "staged" / "fit.usda", tmp_path / "fit.usda"
+    (taken / "x").mkdir(parents=True)
+    staged.parent.mkdir()
+    staged.touch()
+    named = rf"^x: Is a directory \('{taken}'\)\."
+    with pytest.raises(EnvironmentFailure, match=named), environment_failures("x"):
+        publish(staged, taken)
+    immutable = PermissionError(errno.EPERM, "Not permitted", str(staged), None, str(taken))
+    assert str(failure_of_machine(immutable)).startswith(f"{taken}: Not permitted")
+
+
 def test_a_refusal_names_what_was_to_become_of_something_temporary(tmp_path):
     output = tmp_path / "room.usdz"
     with (

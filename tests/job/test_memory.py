@@ -53,6 +53,23 @@ def test_a_container_or_batch_system_may_allow_less(groups, own, limits, expecte
     assert memory.machine_bytes() == (expected or psutil.virtual_memory().total)
 
 
+def test_a_sandbox_without_proc_asks_the_system_itself(tmp_path, monkeypatch):
+    """psutil reads files there; that they are missing has nothing to do with a disk."""
+    whole, own = psutil.virtual_memory().total, psutil.Process().memory_info().rss
+
+    def missing():
+        raise FileNotFoundError(2, "No such file or directory", "/proc/meminfo")
+
+    def gone():
+        raise psutil.NoSuchProcess(os.getpid())
+
+    monkeypatch.setattr(memory, "_OWN_CGROUPS", tmp_path / "none")
+    monkeypatch.setattr(psutil, "virtual_memory", missing)
+    monkeypatch.setattr(psutil, "Process", gone)
+    assert memory.machine_bytes() >= whole  # of a container the host's
+    assert memory.resident_bytes() > own / 2
+
+
 def test_systems_without_control_groups(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "_OWN_CGROUPS", tmp_path / "none")
     assert memory.machine_bytes() == psutil.virtual_memory().total

@@ -196,6 +196,13 @@ def test_a_review_that_is_no_layer_is_named(built, content):
     assert changes_since(built.asset) == {}
 
 
+def test_a_review_that_is_too_large_is_called_so(built):
+    review_file(built.asset).write_text("#usda 1.0\n" + "# words\n" * (1 << 20))
+    with pytest.raises(InputRefused, match=r"review\.usda: this has 8,388,618 bytes, at most"):
+        read_review(built.asset)
+    assert changes_since(built.asset) == {}
+
+
 @pytest.mark.fault("I13")
 @pytest.mark.parametrize("what", ["folder", "pipe", "link that leads nowhere"])
 def test_what_is_in_the_place_of_a_review_is_named_and_not_taken_for_none(built, what):

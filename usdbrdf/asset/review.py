@@ -117,6 +117,11 @@ def read_review(asset: Asset) -> dict[str, Judgement]:
             "objects is to be in it. Put the layer there, from a copy of the asset, or remove it. "
             "[review.layer]"
         )
+    if (size := file.stat().st_size) > _LARGEST:
+        raise InputRefused(
+            f"{file}: this has {size:,} bytes, at most {_LARGEST:,} are read. "
+            "Delete from it what is no review, or move it away. [review.layer]"
+        )
     layer = None
     with suppress(Tf.ErrorException):
         layer = Sdf.Layer.OpenAsAnonymous(str(file)) if _is_plain(file) else None
@@ -140,8 +145,6 @@ def read_review(asset: Asset) -> dict[str, Judgement]:
 
 def _is_plain(file: Path) -> bool:
     """Whether it is a layer of text that USD's parser survives: it fails on deep nesting."""
-    if file.stat().st_size > _LARGEST:
-        return False
     text = _STRING.sub("", read_text(file))
     depth = np.cumsum([{"{": 1, "}": -1}[mark] for mark in re.findall(r"[{}]", text)])
     return text.startswith("#usda") and int(depth.max(initial=0)) <= _DEEPEST

@@ -50,6 +50,7 @@ class Objects(Files):
         self._system, self._prefix = _file_system(address)
         self._pool: ThreadPoolExecutor | None = None
         self._uploads: deque[Future[None]] = deque()
+        self._broken: UsdBrdfError | None = None  # what went wrong with one of them
         # Our files: how workers are told of them, and how many of them are there.
         self._told: dict[Path, tuple[str, str]] = {}
         self._given = 0
@@ -65,7 +66,17 @@ class Objects(Files):
             self._pool = ThreadPoolExecutor(max_workers=_AT_ONCE)
         if len(self._uploads) >= _WAITING:
             self._uploads.popleft().result()
-        self._uploads.append(self._pool.submit(upload, *given))
+        self._uploads.append(self._pool.submit(self._do, upload, *given))
+
+    def _do(self, upload: Callable[..., None], *given: Any) -> None:
+        """Those that wait behind one that failed do not each wait for the store again."""
+        if self._broken is not None:
+            raise self._broken
+        try:
+            upload(*given)
+        except UsdBrdfError as failure:
+            self._broken = failure
+            raise
 
     def _put(self, name: str, size: int | None, write: Callable[[Path], object]) -> None:
         if size is not None and self._has(name, size):
@@ -98,6 +109,7 @@ class Objects(Files):
                     upload.result()
             finally:
                 pool.shutdown(cancel_futures=True)
+                self._broken = None
 
     def found(self, name: str) -> Path:
         return self._copied(name, self.folder / name)
@@ -323,7 +335,8 @@ def _file_system(address: str) -> tuple[Any, str]:
         if kind in ("file", "local"):  # folders are made where there are such
             more["auto_mkdir"] = True
         if kind in ("s3", "s3a"):  # a user's own settings of fsspec count before ours
-            more["config_kwargs"] = _PATIENCE | conf.get(kind, {}).get("config_kwargs", {})
+            own = [conf.get(name, {}).get("config_kwargs", {}) for name in ("s3", "s3a")]
+            more["config_kwargs"] = _PATIENCE | own[0] | own[1]
         system, prefix = url_to_fs(address, use_listings_cache=False, **more)
         if kind in ("s3", "s3a"):
             system.retries = 1  # the client within tries again

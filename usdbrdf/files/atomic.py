@@ -51,6 +51,11 @@ _CURES = {
 }
 # Of a copy, these are about what it was to become.
 _OF_THE_COPY = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+# Of a rename, these are about what was to be replaced, and what it was to be replaced by is ours.
+_OF_THE_TARGET = {
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY,
+    errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY,
+}  # fmt: skip
 _own: set[str] = set()  # names in use by this process, its threads, and those it was forked from
 _swept: set[Path] = set()  # once in a process is enough
 
@@ -302,6 +307,8 @@ def _place_of(error: OSError) -> object:
     named = [error.filename, error.filename2]
     if error.errno in _OF_THE_COPY:
         named = [error.filename2 or error.filename]
+    elif error.errno in _OF_THE_TARGET:
+        named.reverse()
     places = [str(place) for place in named if isinstance(place, str | os.PathLike)]
     for place in places:
         if not _TEMPORARY_PLACE.search(place):

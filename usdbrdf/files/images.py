@@ -28,6 +28,7 @@ from usdbrdf.files.atomic import (
 )
 from usdbrdf.files.camera_colour import space_by_exif
 from usdbrdf.files.channels import colours_of, layers_with_colours
+from usdbrdf.files.icc_profiles import space_of_profile
 from usdbrdf.files.jpeg_bytes import END, JPEG_SUFFIXES, jpeg_without_metadata, segments_of_jpeg
 from usdbrdf.files.paths import readable_size
 from usdbrdf.files.radiance_header import primaries_of_hdr
@@ -173,7 +174,11 @@ def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
     if source.format_name() == "hdr" and (stated := primaries_of_hdr(path)):
         return "", stated
     # Of JPEG and PNG OpenImageIO says sRGB, whatever profile is in them.
+    profile = spec.getattribute("ICCProfile")
     name = spec.getattribute("ICCProfile:profile_description")
+    if profile is not None:
+        known = space_of_profile(np.asarray(profile, np.uint8).tobytes())
+        name = known or name or "an ICC profile without a name"
     if source.format_name() in ("jpeg", "tiff"):
         name = name or space_by_exif(path, spec.getattribute("Exif:ColorSpace"))
     name, places = name or spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")

@@ -32,7 +32,10 @@ def machine_bytes() -> int:
     Lines are ``0::/GROUP`` and ``N:memory:/GROUP``. In a container GROUP may be the host's name
     for it, of which nothing is mounted but the root.
     """
-    limits = [int(psutil.virtual_memory().total)]
+    try:
+        limits = [int(psutil.virtual_memory().total)]
+    except OSError:  # without /proc/meminfo, by which alone some containers tell of less
+        limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     with suppress(OSError):
         for line in _OWN_CGROUPS.read_text().splitlines():
             _, controllers, group = line.split(":", 2)
@@ -48,7 +51,11 @@ def machine_bytes() -> int:
 
 
 def resident_bytes() -> int:
-    return int(psutil.Process().memory_info().rss)
+    """What this process has in memory; where no /proc tells that, the most that it ever had."""
+    try:
+        return int(psutil.Process().memory_info().rss)
+    except (OSError, psutil.Error):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
 
 
 def addresses_of_libraries() -> int:

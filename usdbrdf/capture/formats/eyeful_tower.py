@@ -114,7 +114,8 @@ def _matrix(row: dict[str, Any], key: str, size: int) -> Double | None:
 
 
 def _lens(row: dict[str, Any], name: str, source: Path) -> Lens:
-    model, terms = row.get("distortionModel"), row.get("distortion") or []
+    model = row.get("distortionModel")
+    terms: Any = row.get("distortion")
     sound = isinstance(terms, list) and all(type(term) in (int, float) for term in terms)
     terms = [*map(float, terms), *[0.0] * (8 - len(terms))] if sound else []
     # Those between, of which the authors' converter reads none, are 0 in what they publish.

@@ -190,7 +190,7 @@ def records_of_sidecars(
         focal = number_in(said, "FocalLength35mm")
         lens = _lens(said)
         if lens is None:
-            model, terms = said.get("DistortionModel"), said.get("DistortionCoeficients", "")
+            model, terms = said.get("DistortionModel", ""), said.get("DistortionCoeficients", "")
             raise InputRefused(
                 f"{file}: the lens model {model!r} is not read with the terms {terms[:60]!r}. "
                 "Choose Brown in the alignment's settings, and export again. [capture.camera]"
@@ -212,9 +212,10 @@ def records_of_sidecars(
             continue
         centre = [number_in(said, f"PrincipalPoint{axis}") or 0.0 for axis in "UV"]
         pose = opengl_from_opencv(rigid_pose(rotation.reshape(3, 3).T, place))
-        divided += lens.curve == "division" and lens.bends
         squeeze = number_in(said, "AspectRatio") or 1.0
-        yield from _record(name, image, pose, focal, centre, lens, findings, squeeze)
+        for record in _record(name, image, pose, focal, centre, lens, findings, squeeze):
+            divided += record.lens.curve == "division"
+            yield record
     if divided:
         findings.warn(
             f"{files[0].parent.name}: the lens model of {divided} cameras is Division, whose "
@@ -249,7 +250,7 @@ def _sidecar_values(root: Element) -> dict[str, str]:
 
 def _lens(said: Mapping[str, str]) -> Lens | None:
     """Of the model that an XMP names; None of one that is not read."""
-    model = said.get("DistortionModel", "perspective")
+    model = said.get("DistortionModel", "")
     if model in _NO_TERMS:
         return PINHOLE
     words = said.get("DistortionCoeficients", "").split()
@@ -259,8 +260,13 @@ def _lens(said: Mapping[str, str]) -> Lens | None:
         return None
     if not np.isfinite([k1, *more]).all() or len(more) > 5:
         return None
+    if not (model or k1 or any(more)):
+        return PINHOLE
     if model.startswith("brown"):
-        return _brown([k1, *more])
+        # Of fewer than six, where t1 and t2 stand is known only if there are none.
+        radial = int(model[5:6]) if model[5:6] in ("3", "4") else 4
+        known = len(words) == 6 or not any(more[radial - 1 :])
+        return _brown([k1, *more]) if known else None
     known = model == "division" and not any(more)
     return Lens(curve="division", shape=(k1,)) if known else None
 
