@@ -172,3 +172,11 @@ def test_panes_are_no_lights_whatever_they_are_taken_to_send(tmp_path):
 
     assert min(received(())) > 0
     assert max(received((1,))) == 0
+
+
+def test_the_tree_without_panes_is_built_once_however_often_a_scene_is_changed():
+    surface, _, _ = _world()
+    assert surface.light_rays is surface.rays
+    without = replace(surface, panes=(PANE,))
+    assert without.light_rays is replace(without).light_rays
+    assert without.light_rays is not replace(surface, panes=(CEILING,)).light_rays

@@ -32,16 +32,12 @@ class TexturedScene:
     rays: RayScene
     panes: tuple[int, ...] = ()
 
-    @cached_property
+    @property
     def light_rays(self) -> RayScene:
         """What light meets: all but the panes, triangles with the same numbers."""
         if not self.panes:
             return self.rays
-        triangles = self.scene.triangles.copy()
-        passed = np.isin(self.scene.face_object, self.panes)
-        # Rays meet no triangle without an area.
-        triangles[passed] = triangles[passed, :1]
-        return RayScene(self.scene.points, triangles)
+        return self.rays.without(self.panes, self.scene.face_object)
 
     def of_panes(self) -> Bool:
         """(T,): the texel is a pane's."""

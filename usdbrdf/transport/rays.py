@@ -266,6 +266,7 @@ class RayScene:
         self.points[:] = points
         self.triangles: Int = np.ascontiguousarray(triangles, np.int32)
         self._pool = ThreadPoolExecutor(max_workers=num_threads())
+        self._without: dict[tuple[int, ...], RayScene] = {}
         embree, device = _embree(), _device()
         mesh = embree.rtcNewGeometry(device, _TRIANGLES)
         for kind, form, values in (
@@ -289,6 +290,16 @@ class RayScene:
                 f"Embree cannot take a mesh of {len(triangles):,} triangles (its error {error}): "
                 "free some memory or use a smaller mesh"
             )
+
+    def without(self, passed: tuple[int, ...], owner: Int) -> RayScene:
+        """The same for rays that pass the triangles of some objects, by ``owner`` (F,), which is
+        the same for each call; all keep their numbers. Made once for each ``passed``."""
+        if passed not in self._without:
+            triangles, gone = self.triangles.copy(), np.isin(owner, passed)
+            # Rays meet no triangle without an area.
+            triangles[gone] = triangles[gone, :1]
+            self._without[passed] = RayScene(self.points, triangles)
+        return self._without[passed]
 
     @cached_property
     def boxes(self) -> Float:
