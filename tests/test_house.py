@@ -321,7 +321,6 @@ ENGINEERING: dict[str, str] = {
     "_MOST_EXPOSURE": "limit of what is refused",
     "_MOST_FACES": "memory",
     "_MOST_FILES": "time",
-    "_MOST_LAYERS": "time",
     "_MOST_MEASURED": "time",
     "_MOST_MOVES": "steps of a search",
     "_MOST_NUMBERS": "memory",

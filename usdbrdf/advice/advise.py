@@ -56,6 +56,7 @@ from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import STATE_FOLDER
 from usdbrdf.material.fit_views import MIN_OBSERVATIONS
 from usdbrdf.model.capture import Frames
+from usdbrdf.model.mesh import LEFT_OUT
 from usdbrdf.options import AdviseOptions
 from usdbrdf.transport.lit_scene import LitScene
 
@@ -68,8 +69,6 @@ _SHORTER = 4.0
 _LAMP = 0.5
 # Samples that are no sample: one view less, and there were some.
 _HARDLY_ANY = 10
-# Directives by which nothing is fitted.
-_LEFT_OUT = ("ignore", "glass")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,9 +241,9 @@ def _wanted(atlas: AssetMaps, fits: Sequence[FittedObject]) -> list[int]:
     wanted, areas = [], []
     for i, fit in enumerate(fits):
         own = atlas.texels.of_object(i)
-        if own.stop == own.start or fit.status == "measured" or fit.directive in _LEFT_OUT:
+        if own.stop == own.start or fit.status == "measured":
             continue
-        if fit.is_glass:
+        if fit.is_glass or fit.directive in LEFT_OUT:
             continue
         if atlas.emissive[own].mean() > _LAMP:
             continue

@@ -345,7 +345,7 @@ def _radiance_at(
     hit = points.face >= 0
     place = points.face, points.u, points.v
     lamp = hit & seen.lit.emits(points)
-    shines = np.where((points.face == first.face)[:, None], values[:, :3], seen.measured.at(*place))
+    shines = values[:, :3] if points is first else seen.measured.at(*place)
     values[:, 3:6] = np.where(lamp[:, None], shines, seen.diffuse.at(*place))
     values[outside, 3:6] = radiance_from(seen.lit.environment, -points.to_camera[outside])
     values[:, 7] = lamp

@@ -18,11 +18,11 @@ from usdbrdf.transport.lit_scene import (
     LitScene,
     SurfacePoints,
     View,
+    hits_in_mirror,
     sub_pixel_points,
     visible_points,
 )
 from usdbrdf.transport.lobe_radiance import lobe_basis
-from usdbrdf.transport.rays import lift_from_surface
 
 Basis = Callable[[float], tuple[Float, Float]]
 Projection = Callable[[Double], Double]
@@ -42,10 +42,7 @@ class FrameCounts:
 
 def mirror_hits_emitter(lit: LitScene, points: SurfacePoints) -> Bool:
     """A1 (R,): would a perfect mirror at the point show an emitter to the camera?"""
-    along = np.einsum("rd,rd->r", points.normal, points.to_camera)[:, None]
-    reflected = np.ascontiguousarray(2 * along * points.normal - points.to_camera, np.float32)
-    origin = lift_from_surface(points.position, points.normal, lit.diagonal_m)
-    hits = lit.light_rays.closest(origin, reflected)
+    hits = hits_in_mirror(lit, points)
     return lit.emits(hits) & (hits.face >= 0) & (points.face >= 0)
 
 

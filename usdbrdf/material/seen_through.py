@@ -17,11 +17,8 @@ from usdbrdf.material.verdict import LobeEstimate
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Float
 from usdbrdf.transport.environment import radiance_from
-from usdbrdf.transport.lit_scene import LitScene, SurfacePoints
-from usdbrdf.transport.rays import lift_from_surface
+from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, hits_behind
 
-# So many walls of an object are passed on the way: both of each of a few panes.
-_MOST_LAYERS = 8
 # Steps of expectation maximisation, of what a lobe and what shows through leave.
 _UPDATES = 4
 
@@ -45,22 +42,10 @@ def radiance_behind(lit: LitScene, points: SurfacePoints, index: int) -> Float:
     """(R, 3) W/(m^2 sr): what the rays from the camera meet behind object ``index``, of which
     ``points`` are, and past panes; 0 where that is nothing, and nothing is known of the
     surroundings."""
-    behind = np.zeros((len(points.face), 3), np.float32)
-    direction = np.ascontiguousarray(-points.to_camera, np.float32)
-    origin = lift_from_surface(points.position, direction, lit.diagonal_m)
-    left = np.arange(len(origin))
-    for _ in range(_MOST_LAYERS):
-        if not len(left):
-            break
-        hits = lit.light_rays.closest(origin, direction[left])
-        own = lit.owner(hits.face) == index
-        beyond = left[~own]
-        behind[beyond] = lit.radiance.at(hits.face[~own], hits.u[~own], hits.v[~own])
-        missed = beyond[hits.face[~own] < 0]
-        behind[missed] = radiance_from(lit.environment, direction[missed])
-        reached = origin[own] + direction[left[own]] * hits.distance[own, None]
-        left = left[own]
-        origin = lift_from_surface(reached, direction[left], lit.diagonal_m)
+    beyond, hits = hits_behind(lit, points, np.full(len(points.face), index, np.int32))
+    behind = lit.radiance.at(hits.face, hits.u, hits.v)
+    missed = beyond & (hits.face < 0)
+    behind[missed] = radiance_from(lit.environment, -points.to_camera[missed])
     return behind
 
 

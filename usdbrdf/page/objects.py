@@ -20,7 +20,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.material.fit_target import FrameSeen, frame_samples, relative_costs, seen_in_frame
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import LAMP
+from usdbrdf.model.mesh import LAMP, LEFT_OUT
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import EvaluateOptions
 from usdbrdf.page.pictures import Seen, data_uri, part_around, status_of
@@ -206,7 +206,7 @@ def undetermined_because(fit: FittedObject | None, status: str, *, in_sight: boo
         return "glimpsed"
     if fit is None or status != "prior":
         return status
-    if fit.directive in ("ignore", "glass"):
+    if fit.directive in LEFT_OUT:
         return "told"
     if fit.is_glass:
         return "pane"

@@ -29,16 +29,13 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import Coverage, CoverageMap
 from usdbrdf.transport.environment import pixels_of_directions
-from usdbrdf.transport.lit_scene import SurfacePoints, TexturedScene, points_of_rays
-from usdbrdf.transport.rays import lift_from_surface
+from usdbrdf.transport.lit_scene import TexturedScene, hits_behind, hits_in_mirror, points_of_rays
 from usdbrdf.transport.surface_texture import SurfaceTexture
 
 # So many pixels of a frame are asked at most, and of all.
 _PIXELS, _ALL_PIXELS = 1 << 14, 1 << 22
 # Directions in which rays leave the scan; places of a thing: parts of its diagonal.
 _HEIGHT, _WIDTH, _PLACES = 128, 256, 128
-# Walls of one thing that are passed on the way: both of each of a few panes.
-_MOST_LAYERS = 8
 # Bits of a coordinate of a place, and of a frame's number.
 _BITS, _FRAMES = 12, 24
 # Parts of the frames, each left out in turn.
@@ -178,11 +175,10 @@ def _of_frame(asked: _Asked, camera: Camera, pixels: FramePixels, frame: int, mo
     cosine = np.einsum("rc,rc->r", points.normal, points.to_camera)
     counts = (alone & pixels.valid[part]).ravel() & (owner >= 0) & (cosine > _COSINE)
     which = np.flatnonzero(counts)
-    which = which[_leaves(surface, points.take(which), owner[which])]
-    points, owner, cosine = points.take(which), owner[which], cosine[which]
-    turned = 2 * cosine[:, None] * points.normal - points.to_camera
-    origin = lift_from_surface(points.position, points.normal, surface.diagonal_m)
-    met = surface.rays.closest(origin, np.ascontiguousarray(turned, np.float32))
+    beyond, behind = hits_behind(surface, points.take(which), owner[which])
+    which = which[beyond & (behind.face < 0)]
+    points, owner = points.take(which), owner[which]
+    met = hits_in_mirror(surface, points)
     mirrored = asked.texture.at(met.face, met.u, met.v)[:, 0]
     return _Rays(
         object=owner,
@@ -210,24 +206,6 @@ def _places(position: Float, side: Double | float) -> Long:
     cube = np.floor(position / side).astype(np.int64) & ((1 << _BITS) - 1)
     place: Long = (cube[:, 0] << (2 * _BITS)) + (cube[:, 1] << _BITS) + cube[:, 2]
     return place
-
-
-def _leaves(surface: TexturedScene, points: SurfacePoints, owner: Int) -> Bool:
-    """(R,): the ray from the camera meets nothing behind the object that it meets first."""
-    leaves = np.zeros(len(owner), np.bool_)
-    direction = np.ascontiguousarray(-points.to_camera, np.float32)
-    origin = lift_from_surface(points.position, direction, surface.diagonal_m)
-    left = np.arange(len(owner))
-    for _ in range(_MOST_LAYERS):
-        if not len(left):
-            break
-        hits = surface.rays.closest(origin, direction[left])
-        leaves[left[hits.face < 0]] = True
-        own = surface.owner(hits.face) == owner[left]
-        reached = origin[own] + direction[left[own]] * hits.distance[own, None]
-        left = left[own]
-        origin = lift_from_surface(reached, direction[left], surface.diagonal_m)
-    return leaves
 
 
 def _told(rays: _Rays, logs: Float) -> Through | None:

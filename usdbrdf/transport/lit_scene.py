@@ -18,7 +18,7 @@ from usdbrdf.model.texels import Texels
 from usdbrdf.transport.brdf import BECKMANN, CONDUCTOR, DIELECTRIC, PAPER
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lights import BRIGHTER_THAN, Lights, lights_from_radiance
-from usdbrdf.transport.rays import Hits, RayScene
+from usdbrdf.transport.rays import Hits, RayScene, lift_from_surface
 from usdbrdf.transport.surface_texture import SurfaceTexture, surface_texture
 
 
@@ -68,6 +68,8 @@ class TexturedScene:
 
 # Lobes pick among all lights alike, by power: each of the few rays is to meet one that shows.
 _BRIGHTER_THAN = 6.0
+# So many walls of an object are passed on the way: both of each of a few panes.
+_MOST_LAYERS = 8
 
 
 class SurfacePoints(NamedTuple):
@@ -150,6 +152,37 @@ def past_panes(
     for values, some in zip(found, behind, strict=True):
         values[passes] = some
     return found
+
+
+def hits_behind(surface: TexturedScene, points: SurfacePoints, owner: Int) -> tuple[Bool, Hits]:
+    """Which rays (R,) of the points go on past all walls of their objects, ``owner`` (R,), and what
+    they meet of others past panes; face -1 where nothing."""
+    count = len(points.face)
+    direction = np.ascontiguousarray(-points.to_camera, np.float32)
+    origin = lift_from_surface(points.position, direction, surface.diagonal_m)
+    left, beyond = np.arange(count), np.zeros(count, np.bool_)
+    none = np.zeros(count, np.float32)
+    found = Hits(np.full(count, -1, np.int32), none, none.copy(), none.copy())
+    for _ in range(_MOST_LAYERS):
+        if not len(left):
+            break
+        hits = surface.light_rays.closest(origin, direction[left])
+        own = surface.owner(hits.face) == owner[left]
+        beyond[left[~own]] = True
+        for values, some in zip(found, hits, strict=True):
+            values[left[~own]] = some[~own]
+        reached = origin[own] + direction[left[own]] * hits.distance[own, None]
+        left = left[own]
+        origin = lift_from_surface(reached, direction[left], surface.diagonal_m)
+    return beyond, found
+
+
+def hits_in_mirror(surface: TexturedScene, points: SurfacePoints) -> Hits:
+    """What a perfect mirror at each of the points (R,) would show to the camera, past panes."""
+    along = np.einsum("rd,rd->r", points.normal, points.to_camera)[:, None]
+    reflected = np.ascontiguousarray(2 * along * points.normal - points.to_camera, np.float32)
+    origin = lift_from_surface(points.position, points.normal, surface.diagonal_m)
+    return surface.light_rays.closest(origin, reflected)
 
 
 def points_of_texels(texels: Texels, index: Long, eye: Double) -> SurfacePoints:
