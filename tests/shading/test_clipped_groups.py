@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 
 from tests.physics.surfaces import Part, World, quad, room, world_of
 from usdbrdf.model.texels import CoverageMap
-from usdbrdf.shading import clipped_light
+from usdbrdf.shading import clipped_groups as groups_of_clipped
 from usdbrdf.shading.clipped_emitters import EstimatedRadiance
-from usdbrdf.shading.clipped_light import clipped_groups, lamps_with_unseen
+from usdbrdf.shading.clipped_groups import clipped_groups
+from usdbrdf.shading.clipped_light import lamps_with_unseen
 
 WALL, LAMP = 2, 6
 BOUND = 3.0
@@ -61,7 +62,7 @@ def _told(world: World, lit: np.ndarray, clipped: np.ndarray, unseen, times=9.0,
 
 
 def test_walls_are_no_lamps_although_there_are_too_many_groups(world: World, own, monkeypatch):
-    monkeypatch.setattr(clipped_light, "_MAX_GROUPS", 1)
+    monkeypatch.setattr(groups_of_clipped, "_MAX_GROUPS", 1)
     lit = world.per_object([(0.9 * BOUND,) * 3] * 6 + [(0.1 * BOUND,) * 3])
     patch, lamp = own(WALL).reshape(32, 32)[8:16, 8:16].ravel(), own(LAMP)[:64]
     lit[patch] = lit[lamp] = BOUND
@@ -83,6 +84,29 @@ def test_a_clipped_lamp_is_one_group_with_what_nobody_saw_of_it(world: World, ow
     assert found.object[0] == LAMP
     assert found.bound[0] == BOUND
     np.testing.assert_array_equal(np.flatnonzero(found.group == 0), lamp)
+
+
+def test_a_lamp_of_which_frames_show_next_to_nothing_is_one(world: World, own):
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 6 + [(0.1 * BOUND,) * 3])
+    lamp = own(LAMP)
+    found = _groups(world, lit, lamp[:3], unseen=lamp[3:])
+    np.testing.assert_array_equal(found.lamp, [True])
+    np.testing.assert_array_equal(np.flatnonzero(found.group == 0), lamp)
+
+
+def test_few_clipped_texels_of_what_else_is_measured_are_a_glint(world: World, own):
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 7)
+    assert len(_groups(world, lit, own(LAMP)[:3])) == 0
+
+
+def test_of_too_many_groups_lamps_stay_since_they_may_be_brighter(world: World, own, monkeypatch):
+    monkeypatch.setattr(groups_of_clipped, "_MAX_GROUPS", 1)
+    lit = world.per_object([(0.9 * BOUND,) * 3] * 6 + [(0.5 * BOUND,) * 3])
+    patch, lamp = own(WALL).reshape(32, 32)[4:24, 4:20].ravel(), own(LAMP)
+    lit[patch] = BOUND
+    found = _groups(world, lit, np.concatenate([patch, lamp]))
+    assert 2 * world.texels.area[lamp].sum() < world.texels.area[patch].sum()
+    np.testing.assert_array_equal(found.object, [LAMP])
 
 
 def test_lamps_set_into_a_wall_are_groups_of_their_own(world: World, own):
@@ -187,7 +211,7 @@ def test_a_lamp_s_neighbourhood_alone_is_looked_at(world: World, own, monkeypatc
             looked.append(len(points) if self.m == 6 else 0)
             return found
 
-    monkeypatch.setattr(clipped_light, "cKDTree", Tree)
+    monkeypatch.setattr(groups_of_clipped, "cKDTree", Tree)
     unseen = [*wall[8:20, 16:20].ravel(), *wall[24:].ravel()]
     found, _ = _told(world, lit, lamp, unseen)
     assert np.count_nonzero(found.group == 0) > len(lamp)
@@ -204,7 +228,7 @@ def test_a_part_without_area_or_with_all_around_it_seen_is_what_was_seen(world: 
     area[lamp] = 0 if hidden else area[lamp]
     texels = replace(world.texels, area=area)
     observed = np.setdiff1d(own(WALL), beside)
-    part = clipped_light._with_unseen(texels, lamp, observed, beside if hidden else beside[:0])
+    part = groups_of_clipped.with_unseen(texels, lamp, observed, beside if hidden else beside[:0])
     np.testing.assert_array_equal(part, lamp)
 
 

@@ -18,12 +18,8 @@ from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
 from usdbrdf.shading import clipped_light, lamp_light
 from usdbrdf.shading.clipped_emitters import EstimatedRadiance
-from usdbrdf.shading.clipped_light import (
-    ClippedGroups,
-    ClippedLight,
-    _with_estimates,
-    estimate_clipped_light,
-)
+from usdbrdf.shading.clipped_groups import ClippedGroups
+from usdbrdf.shading.clipped_light import ClippedLight, _with_estimates, estimate_clipped_light
 from usdbrdf.transport.environment import Environment, Sun, black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -88,13 +84,32 @@ def _estimated(
     folder: Path,
     environment: Environment = NO_LIGHT,
     said: Mapping[int, bool] = NOTHING_SAID,
+    open_to_sky: tuple[int, ...] = (),
 ) -> ClippedLight:
     eyes = [np.array(eye) for eye in ((0.4, 0.4, 1.5), (3.6, 2.6, 1.5), (0.4, 2.6, 1.2))]
     frames = frames_at([look_at(eye, np.array([2.0, 1.5, 1.0])) for eye in eyes])
-    surface = TexturedScene(world.scene, world.texels, world.rays)
+    surface = TexturedScene(world.scene, world.texels, world.rays, panes=open_to_sky)
     run = TaskRun(folder, "shade", folder / "work")
     coverage = CoverageMap.of(~clipped, clipped)
     return estimate_clipped_light(run, surface, lit, coverage, frames, environment, 0, said)
+
+
+def test_a_night_sky_takes_no_lamp_for_what_reflects_it(
+    world: World, truth: np.ndarray, tmp_path: Path, monkeypatch
+):
+    asked = []
+
+    def reflects(surface, lit, coverage, frames, groups, *_):
+        asked.append(len(groups))
+        return np.zeros(len(groups), np.bool_)
+
+    monkeypatch.setattr(clipped_light, "reflects_other_light", reflects)
+    clipped = (truth >= SATURATION).any(axis=1)
+    lit = np.where(clipped[:, None], np.float32(SATURATION), truth)
+    for level, times in ((1e-4, 0), (1.0, 1)):
+        sky = Environment(np.full((4, 8, 3), level, np.float32), True)
+        _estimated(world, lit, clipped, tmp_path / str(times), sky, open_to_sky=(3,))
+        assert len(asked) == times
 
 
 def test_the_lamps_are_as_bright_as_their_light_says(

@@ -11,11 +11,8 @@ from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
-from usdbrdf.shading.clipped_light import (
-    clipped_groups,
-    estimate_clipped_light,
-    reflects_other_light,
-)
+from usdbrdf.shading.clipped_groups import clipped_groups
+from usdbrdf.shading.clipped_light import estimate_clipped_light, reflects_other_light
 from usdbrdf.shading.hidden_light import KnownLamps, _albedo, light_of_hidden
 from usdbrdf.transport.environment import NO_SUN, Environment, Sun, black_environment
 from usdbrdf.transport.irradiance import irradiance_at

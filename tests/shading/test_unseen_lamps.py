@@ -13,7 +13,8 @@ from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading import shaded
-from usdbrdf.shading.clipped_light import clipped_groups, estimate_clipped_light
+from usdbrdf.shading.clipped_groups import clipped_groups
+from usdbrdf.shading.clipped_light import estimate_clipped_light
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
 from usdbrdf.shading.lamp_light import known_well, looked_at_closely
 from usdbrdf.shading.outside_light import Asked, Sources, gloss_of_scene, solved

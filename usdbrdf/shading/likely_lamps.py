@@ -18,7 +18,7 @@ from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import first_of_segments
-from usdbrdf.shading.clipped_light import ClippedGroups, clipped_groups
+from usdbrdf.shading.clipped_groups import ClippedGroups, clipped_groups
 from usdbrdf.shading.lamp_light import Lamps, beside_lamps
 from usdbrdf.shading.outside_light import Asked, medians_of_segments
 from usdbrdf.transport.environment import Environment

@@ -22,7 +22,8 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.base_color import albedo_map, clear_of
-from usdbrdf.shading.clipped_light import ClippedLight, clipped_groups, estimate_clipped_light
+from usdbrdf.shading.clipped_groups import clipped_groups
+from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.shading.hidden_light import KnownLamps, said_to_shine, with_hidden_light
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.panes import beside_panes

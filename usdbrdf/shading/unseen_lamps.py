@@ -21,7 +21,7 @@ from usdbrdf.model.arrays import Array, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import asked_texels
-from usdbrdf.shading.clipped_light import clipped_groups
+from usdbrdf.shading.clipped_groups import clipped_groups
 from usdbrdf.shading.lamp_light import (
     LEAST_PART,
     MOST_OF_CERTAIN,
