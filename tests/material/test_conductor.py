@@ -124,6 +124,25 @@ def test_the_roughest_metal_is_told_by_nobody_but_a_person():
     assert _found(rough, 1.0, phi=0.6, certain=True) is not None
 
 
+@pytest.mark.parametrize(
+    ("psi", "evidence", "asked"),
+    [(1.0, 0.16, True), (0.9, 0.16, False), (0.9, 0.5, True), (0.3, 0.5, False)],
+)
+def test_a_mirror_is_looked_for_though_a_dielectric_explains_next_to_nothing_of_it(
+    psi: float, evidence: float, asked: bool, monkeypatch
+):
+    """1 - (1 - 0.08 / 0.95)^2 = 0.16 of what a silver mirror shows."""
+    first = LobeEstimate(0.0, psi, 0.01, 0.1, 0.0, 1.0, evidence)
+    seen = []
+    monkeypatch.setattr(fit_views, "repeated_where_noisy", lambda first, *_: first)
+    monkeypatch.setattr(fit_views, "conductor_of", lambda *_, **__: seen.append(1))
+    zeros = np.zeros((1, 3), np.float32)
+    samples = SimpleNamespace(radiance=zeros, texel=np.zeros(1, np.int64))
+    sampled = SimpleNamespace(samples=samples, irradiance=zeros, basis=lambda *_: _basis(2))
+    fit_views.fit_views(DIELECTRIC, lambda: sampled, 0, first)
+    assert bool(seen) == asked
+
+
 @pytest.mark.parametrize("texture", [0.0, 0.4])
 def test_a_dielectric_is_none(texture: float):
     # psi = 0.9 under a diffuse part, plain or patterned.

@@ -296,7 +296,10 @@ def fit_views(
         return fit_kinds(sampled(), [lobe], own_seed, repeats)[lobe].lobe
 
     found = repeated_where_noisy(first or fitted(first_seed(seed), 1), fitted, seed)
-    bright = found.psi + 2 * found.psi_error > 1 and found.evidence > SOME_EVIDENCE
+    # Of what a mirror shows a dielectric explains next to nothing, however bright it is.
+    brightest = found.psi + found.of_rays[1] >= 1
+    shows = brightest or found.evidence > SOME_EVIDENCE
+    bright = shows and found.psi + 2 * found.psi_error > 1
     if not (bright or metal) or (irradiance := sampled().irradiance) is None:
         return found, None
     samples = sampled().samples
@@ -320,7 +323,8 @@ def with_doubts_of_light(
     """The same with the errors that follow from those of light that was inferred, not seen: what a
     lobe mirrors of a lamp is psi times the lamp's radiance, and only that is measured. All doubts
     are taken to be off the same way. Where psi is badly known anyway nothing is traced."""
-    if found.evidence < SOME_EVIDENCE or (found.psi_error > MAX_PSI_ERROR and metal is None):
+    untold = found.evidence < SOME_EVIDENCE or found.psi_error > MAX_PSI_ERROR
+    if untold and metal is None:
         return found, metal
     kind, phi, psi = lobe, found.phi, found.psi
     if metal is not None:
