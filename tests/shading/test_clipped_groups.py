@@ -89,9 +89,15 @@ def test_a_clipped_lamp_is_one_group_with_what_nobody_saw_of_it(world: World, ow
 def test_a_lamp_of_which_frames_show_next_to_nothing_is_one(world: World, own):
     lit = world.per_object([(0.2, 0.2, 0.2)] * 6 + [(0.1 * BOUND,) * 3])
     lamp = own(LAMP)
-    found = _groups(world, lit, lamp[:3], unseen=lamp[3:])
+    found = _groups(world, lit, lamp[:15], unseen=lamp[15:])
     np.testing.assert_array_equal(found.lamp, [True])
     np.testing.assert_array_equal(np.flatnonzero(found.group == 0), lamp)
+
+
+def test_a_glint_is_not_all_that_an_object_is(world: World, own):
+    lit = world.per_object([(0.2, 0.2, 0.2)] * 6 + [(0.1 * BOUND,) * 3])
+    lamp = own(LAMP)
+    assert len(_groups(world, lit, lamp[:3], unseen=lamp[3:])) == 0
 
 
 def test_few_clipped_texels_of_what_else_is_measured_are_a_glint(world: World, own):

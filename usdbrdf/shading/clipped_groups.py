@@ -18,6 +18,7 @@ from usdbrdf.shading.clipped_emitters import LAMP_PRIOR
 from usdbrdf.shading.lamp_light import Lamps
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
+_SHOWN_OF_SMALL = calibration.number("lamps.shown_of_small")
 # More lamps are not told apart; the faintest keep their bounds.
 _MAX_GROUPS = 24
 _REACH = calibration.number("lamps.reach")
@@ -92,9 +93,10 @@ def clipped_groups(
     for i in range(len(texels.resolution)):
         own = np.arange(*texels.of_object(i).indices(len(texels)))
         candidates, around = own[clipped[own]], own[measured[own]]
-        # A lamp may be as small as it likes; a few clipped texels of a surface are a glint.
-        whole = texels.area[candidates].sum() > texels.area[around].sum()
-        if not whole and len(candidates) < _MIN_TEXELS:
+        shines, area = texels.area[candidates].sum(), texels.area[own].sum()
+        whole = shines > texels.area[around].sum()
+        # A lamp may be as small as it likes; few texels of what nobody saw as a whole are a glint.
+        if len(candidates) < _MIN_TEXELS and not (whole and shines > _SHOWN_OF_SMALL * area):
             continue
         parts = [own[~measured[own]]] if whole else _connected(texels, candidates)
         for part in parts:
