@@ -126,7 +126,13 @@ def test_the_roughest_metal_is_told_by_nobody_but_a_person():
 
 @pytest.mark.parametrize(
     ("psi", "evidence", "asked"),
-    [(1.0, 0.16, True), (0.9, 0.16, False), (0.9, 0.5, True), (0.3, 0.5, False)],
+    [
+        (1.0, 0.16, True),
+        (1.0, 0.02, False),
+        (0.9, 0.16, False),
+        (0.9, 0.5, True),
+        (0.3, 0.5, False),
+    ],
 )
 def test_a_mirror_is_looked_for_though_a_dielectric_explains_next_to_nothing_of_it(
     psi: float, evidence: float, asked: bool, monkeypatch

@@ -296,9 +296,9 @@ def fit_views(
         return fit_kinds(sampled(), [lobe], own_seed, repeats)[lobe].lobe
 
     found = repeated_where_noisy(first or fitted(first_seed(seed), 1), fitted, seed)
-    # Of what a mirror shows a dielectric explains next to nothing, however bright it is.
-    brightest = found.psi + found.of_rays[1] >= 1
-    shows = brightest or found.evidence > SOME_EVIDENCE
+    # The brightest dielectric explains that much of what a mirror of all light shows.
+    explained = 1 - (1 - F0_OF_PSI) ** 2 if found.psi + found.of_rays[1] >= 1 else 1.0
+    shows = found.evidence > explained * SOME_EVIDENCE
     bright = shows and found.psi + 2 * found.psi_error > 1
     if not (bright or metal) or (irradiance := sampled().irradiance) is None:
         return found, None

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,7 +47,7 @@ _TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
 _CLOSELY = 8
 # Texels of a part that are asked whether daylight explains them.
 _ASKED = 128
-_LEAST_DAYLIGHT = calibration.number("lamps.least_daylight")
+_LEAST_OF_LIGHT = calibration.number("lamps.least_of_light")
 _SOME_EXPLAINED, _EXPLAINED = calibration.pair("lamps.explained_by_daylight")
 
 
@@ -135,36 +136,8 @@ def estimate_clipped_light(
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
-        wall = np.zeros(len(groups), np.bool_)
-        chosen, segment = _chosen(surface.texels, groups, coverage.measured, seed)
-        if not len(chosen):
-            return {**vars(nothing_known(len(groups))), "wall": wall}
-
-        # With their bounds, whatever light of the sun what clips is taken to reflect.
-        asked = asked_texels(surface.texels, lit, coverage, seed)
-
-        def told_by(light: Float, groups: ClippedGroups) -> tuple[EstimatedRadiance, Bool]:
-            evidence = _evidence(surface, light, groups, chosen, segment, environment, seed)
-            first = estimate_clipped_emitters(evidence)
-            given = surface, light, asked, frames, environment, groups, first, seed
-            return _told_by_even_light(*given)
-
-        told, evenly = told_by(lit, groups)
-        by_day = _lit_from_outside(surface, lit, environment, chosen, seed)
-        if lit_unseen or environment.sun.shines or by_day:
-            by_hand = np.array([said.get(int(i), -1) for i in groups.object])
-            # Beside a window lamps as bright as need be take up what its light leaves unexplained:
-            # where other light suffices, one must show itself in the light that it casts evenly.
-            # What a person says is no lamp reflects, and may do so of that light alone.
-            least = np.where(by_hand == 1, np.inf, np.where(evenly, told.least().max(axis=1), 1.0))
-            weighed = replace(groups, lamp=groups.lamp | (by_hand == 0))
-            given = surface, lit, coverage, frames, weighed, least, environment, seed
-            wall = reflects_other_light(*given)
-        if wall.any():
-            # What the sun shines on may be many times its bound, which lamps beside it would send.
-            left = groups.with_walls(wall)
-            light = _reflecting(surface, lit, coverage, left, wall, environment, seed, said)
-            told = told_by(light, left.without(wall))[0].of_lamps(~wall)
+        weighing = _Weighing.of(surface, lit, coverage, frames, environment, groups, said, seed)
+        told, wall = weighing.told(lit_unseen)
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
@@ -184,16 +157,97 @@ def estimate_clipped_light(
     )
 
 
-def _lit_from_outside(
-    surface: TexturedScene, lit: Float, environment: Environment, chosen: Long, seed: int
-) -> bool:
-    """Whether the sky lights the texels ``chosen`` (N,) enough to be told from nothing, as one
-    by night does not."""
-    if not environment.image.any():
-        return False
-    shining = Shining.of(surface, np.zeros_like(lit), environment)
-    light = irradiance_of_texels(surface, shining, environment, chosen, seed)
-    return bool(light.mean() > _LEAST_DAYLIGHT * np.pi * lit[chosen].mean())
+class _Weighing(NamedTuple):
+    """The ``groups`` and all that tells of their light; chosen, segment (N,): see ``_chosen``."""
+
+    surface: TexturedScene
+    lit: Float
+    coverage: CoverageMap
+    frames: Frames
+    environment: Environment
+    groups: ClippedGroups
+    said: Mapping[int, bool]
+    seed: int
+    chosen: Long
+    segment: Int
+    asked: Asked | None
+
+    @classmethod
+    def of(
+        cls,
+        surface: TexturedScene,
+        lit: Float,
+        coverage: CoverageMap,
+        frames: Frames,
+        environment: Environment,
+        groups: ClippedGroups,
+        said: Mapping[int, bool],
+        seed: int,
+    ) -> _Weighing:
+        chosen = _chosen(surface.texels, groups, coverage.measured, seed)
+        # With their bounds, whatever light of the sun what clips is taken to reflect.
+        asked = asked_texels(surface.texels, lit, coverage, seed)
+        return cls(surface, lit, coverage, frames, environment, groups, said, seed, *chosen, asked)
+
+    def told(self, lit_unseen: bool) -> tuple[EstimatedRadiance, Bool]:
+        """The estimate, and which of the groups (K,) reflect the light of others than these."""
+        groups, wall = self.groups, np.zeros(len(self.groups), np.bool_)
+        if not len(self.chosen):
+            return nothing_known(len(groups)), wall
+        told, evenly = self._by(self.lit, groups)
+        if lit_unseen or self.environment.sun.shines or self._is_day():
+            wall = self._reflect_other_light(told, evenly)
+        if wall.any():
+            # What the sun shines on may be many times its bound, which lamps beside it would send.
+            told = self._beside(self.lit, wall)
+        walls = wall | ~groups.lamp
+        if told.determined[~walls].any() and self._matter(walls):
+            # So may what the lamps themselves shine on.
+            told = self._beside(_with_estimates(self.lit, groups, told.of_lamps(~walls)), walls)
+        return told, wall
+
+    def _by(self, light: Float, groups: ClippedGroups) -> tuple[EstimatedRadiance, Bool]:
+        """As of ``_told_by_even_light``."""
+        surface, outside, seed = self.surface, self.environment, self.seed
+        evidence = _evidence(surface, light, groups, self.chosen, self.segment, outside, seed)
+        first = estimate_clipped_emitters(evidence)
+        given = surface, light, self.asked, self.frames, outside, groups, first, seed
+        return _told_by_even_light(*given)
+
+    def _beside(self, light: Float, walls: Bool) -> EstimatedRadiance:
+        """In ``light`` (T, 3) with what those of the groups (K,) reflect of it."""
+        left = self.groups.with_walls(walls)
+        given = self.coverage, left, walls, self.environment, self.seed, self.said
+        light = _reflecting(self.surface, light, *given)
+        return self._by(light, left.without(walls))[0].of_lamps(~walls)
+
+    def _reflect_other_light(self, told: EstimatedRadiance, evenly: Bool) -> Bool:
+        groups = self.groups
+        by_hand = np.array([self.said.get(int(i), -1) for i in groups.object])
+        # Beside a window lamps as bright as need be take up what its light leaves unexplained:
+        # where other light suffices, one must show itself in the light that it casts evenly.
+        # What a person says is no lamp reflects, and may do so of that light alone.
+        least = np.where(by_hand == 1, np.inf, np.where(evenly, told.least().max(axis=1), 1.0))
+        weighed = replace(groups, lamp=groups.lamp | (by_hand == 0))
+        given = self.coverage, self.frames, weighed, least, self.environment, self.seed
+        return reflects_other_light(self.surface, self.lit, *given)
+
+    def _is_day(self) -> bool:
+        """Whether the sky lights the texels chosen, as one by night does not."""
+        outside = self.environment
+        return bool(outside.image.any()) and self._lights(np.zeros_like(self.lit), outside)
+
+    def _matter(self, walls: Bool) -> bool:
+        """Whether those of the groups (K,), at their bounds, light the texels chosen."""
+        clips = self.groups.texels_of(walls)[:, None]
+        return self._lights(np.where(clips, self.lit, np.float32(0)), black_environment())
+
+    def _lights(self, light: Float, outside: Environment) -> bool:
+        """Whether that alone is more than next to nothing of what the texels chosen reflect."""
+        shining = Shining.of(self.surface, light, outside)
+        received = irradiance_of_texels(self.surface, shining, outside, self.chosen, self.seed)
+        reflected = np.pi * self.lit[self.chosen].mean()
+        return bool(received.mean() > _LEAST_OF_LIGHT * reflected)
 
 
 def reflects_other_light(
