@@ -4,11 +4,13 @@ Meshing, MeshFiltering or Texturing.
 A pose is the camera's centre and the rotation from the world to it (OpenCV's axes), column by
 column. Numbers are texts. Focal lengths are in mm of a sensor whose width is stated, older ones in
 pixels; how the second follows from the first has changed with the document's version. So has the
-frame of exported meshes: since 1.2.3 their y and z are those of the cameras, negated.
+frame of exported meshes: since 1.2.3 their y and z are those of the cameras, negated. Of a rig the
+pose is the rig's, and each camera has its own within it.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -112,27 +114,51 @@ def shots_of(document: object, version: Version, source: Path) -> list[Shot]:
         str(row.get("intrinsicId")): _camera(row, version, source)
         for row in rows_of(document, "intrinsics")
     }
-    poses = {str(row.get("poseId")): _pose(row, version) for row in rows_of(document, "poses")}
+    turn = _OPENGL if version >= _SINCE["meshes in OpenGL's frame"] else np.eye(3)
+    poses = {str(row.get("poseId")): _pose(row, turn) for row in rows_of(document, "poses")}
+    rig_from_camera = {
+        (str(row.get("rigId")), str(number)): _pose_in_rig(place)
+        for row in rows_of(document, "rigs")
+        for number, place in enumerate(rows_of(row, "subPoses"))
+    }
+    views = rows_of(document, "views")
+    shared = Counter(str(view.get("poseId")) for view in views)
     found = []
-    for view in rows_of(document, "views"):
+    for view in views:
+        pose, problem = poses.get(str(view.get("poseId"))), ""
         # Of a rig one pose is that of all its cameras, unless each has its own.
-        apart = str(view.get("isPoseIndependant", "true")).lower() in ("true", "1")
-        of_rig = "rigId" in view and not (apart and str(view.get("poseId")) in poses)
+        together = "true" if shared[str(view.get("poseId"))] == 1 else "false"
+        apart = str(view.get("isPoseIndependant", together)).lower() in ("true", "1")
+        if "rigId" in view and not apart and pose is not None:
+            place = rig_from_camera.get((str(view["rigId"]), str(view.get("subPoseId"))))
+            problem = "nothing says where it stands in its rig" if place is None else ""
+            pose = pose if place is None else pose @ place
         found.append(
             Shot(
                 name=str(view.get("path") or view.get("viewId")),
                 camera=cameras.get(str(view.get("intrinsicId"))),
-                world_from_camera=poses.get(str(view.get("poseId"))),
-                problem="it is one of a rig, whose poses are not read" if of_rig else "",
+                world_from_camera=pose,
+                problem=problem,
             )
         )
     return found
 
 
-def _pose(row: dict[str, Any], version: Version) -> Double | None:
+def _pose_in_rig(place: dict[str, Any]) -> Double | None:
+    """(4, 4) from a camera of a rig to it; None where that was never found."""
+    if str(place.get("status", "")).lower() == "uninitialized":
+        return None
+    return _rigid(place.get("pose"), np.eye(3))
+
+
+def _pose(row: dict[str, Any], turn: Double) -> Double | None:
     """(4, 4) world from camera, in the frame of the meshes."""
     holder = row.get("pose")
-    stated = holder.get("transform") if isinstance(holder, dict) else None
+    return _rigid(holder.get("transform") if isinstance(holder, dict) else None, turn)
+
+
+def _rigid(stated: object, turn: Double) -> Double | None:
+    """(4, 4) of a rotation and a centre, turned; None where there are none."""
     if not isinstance(stated, dict):
         return None
     rotation, centre = (
@@ -141,7 +167,6 @@ def _pose(row: dict[str, Any], version: Version) -> Double | None:
     )
     if rotation is None or centre is None:
         return None
-    turn = _OPENGL if version >= _SINCE["meshes in OpenGL's frame"] else np.eye(3)
     # Column by column of what turns the world: row by row of what turns the camera.
     return rigid_pose(turn @ rotation.reshape(3, 3), turn @ centre)
 
