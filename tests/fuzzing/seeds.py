@@ -28,6 +28,7 @@ from tests.capture import (
     test_scan_from_fipt,
     test_scan_from_llff,
     test_scan_from_metashape,
+    test_scan_from_opf,
     test_scan_from_pix4d,
     test_scan_from_realityscan,
     test_scan_from_replica,
@@ -460,6 +461,12 @@ def bundler(folder: Path) -> list[Seed]:
 
 def pix4d(folder: Path) -> list[Seed]:
     return _document(folder, test_scan_from_pix4d, test_scan_from_pix4d.PARAMETERS)
+
+
+def opf(folder: Path) -> list[Seed]:
+    room = _room().square()
+    test_scan_from_opf._write(folder, room, test_scan_from_opf._documents(room))
+    return _capture(folder, "room.opf", "parts/*.json")
 
 
 def visualsfm(folder: Path) -> list[Seed]:

@@ -170,6 +170,10 @@ _PROGRAMS = (
         _NOTHING, "Bring the project's 1_initial/params/*_calibrated_camera_parameters.txt",
     ),
     _Program(
+        "PIX4Dmatic", (), (), rb'"application/opf-(?!project)',
+        "Name the project's folder, which has its .opf",
+    ),
+    _Program(
         "OpenDroneMap", ("shots.geojson",), (), _NOTHING,
         "Bring opensfm/reconstruction.json of the project, and a mesh in its frame",
     ),
