@@ -4,6 +4,7 @@ dialects of its versions."""
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -22,8 +23,8 @@ from tests.format_truth import (
     write_obj,
 )
 from usdbrdf.capture.adapters import choose_adapter, read_scan
-from usdbrdf.capture.reconstructions.meshroom import shots_of
-from usdbrdf.errors import InputRefused
+from usdbrdf.capture.reconstructions.meshroom import beside, shots_of
+from usdbrdf.errors import InputRefused, MeshMissing
 from usdbrdf.options import IngestOptions
 
 OPTIONS = IngestOptions(assume_srgb=True)
@@ -109,6 +110,55 @@ def test_every_version_is_the_room(tmp_path, version):
     points = room.points * (OPENGL if turned else 1)
     assert_same(scan, room, points=points, poses=poses, names=room.names)
     assert scan.adapter == "meshroom"
+
+
+def _project(folder, room):
+    """As Meshroom leaves it: what its nodes have made lies in a cache, by their results' hashes."""
+    _write(folder, room, _document(room))
+    (folder / "room.mg").write_text('{"header": {"fileVersion": "1.1"}, "graph": {}}')
+    photographs = _document(room) | {"poses": []}
+    for node, file, made in (
+        ("CameraInit", "cameraInit.sfm", json.dumps(photographs)),
+        ("StructureFromMotion", "cameras.sfm", (folder / "cameras.sfm").read_text()),
+        ("Texturing", "texturedMesh.obj", (folder / "texturedMesh.obj").read_text()),
+    ):
+        place = folder / "MeshroomCache" / node / "5ac2b90d"
+        place.mkdir(parents=True)
+        (place / file).write_text(made)
+    (folder / "cameras.sfm").unlink()
+    (folder / "texturedMesh.obj").unlink()
+    return folder
+
+
+@pytest.mark.parametrize(
+    "named",
+    [
+        ".", "MeshroomCache", "MeshroomCache/StructureFromMotion/5ac2b90d",
+        "MeshroomCache/StructureFromMotion/5ac2b90d/cameras.sfm",
+    ],
+)  # fmt: skip
+def test_a_whole_project_is_read_from_its_cache(tmp_path, named):
+    room = truth()
+    project = _project(tmp_path, room)
+    scan = read_scan(project / named, OPTIONS)
+    poses = np.diag([*OPENGL, 1.0]) @ room.world_from_camera[_order()]
+    assert_same(scan, room, points=room.points * OPENGL, poses=poses)
+    read = {file.name for file in beside(project / named)}
+    assert read == (set() if named == "." else {"texturedMesh.obj", *_names()})
+
+
+def _names():
+    return {f"{i:04d}.jpg" for i in range(5)}
+
+
+def test_of_several_results_nobody_knows_which_belong_together(tmp_path):
+    cache = _project(tmp_path, truth()) / "MeshroomCache"
+    shutil.copytree(cache / "Texturing/5ac2b90d", cache / "Texturing/77")
+    with pytest.raises(MeshMissing, match="or name one with --mesh"):
+        read_scan(tmp_path, OPTIONS)
+    shutil.copytree(cache / "StructureFromMotion/5ac2b90d", cache / "StructureFromMotion/77")
+    with pytest.raises(InputRefused, match="2 nodes of the project have found cameras"):
+        read_scan(tmp_path, OPTIONS)
 
 
 def _fov(plane, terms):

@@ -64,6 +64,13 @@ def test_the_largest_reconstruction_is_the_room(tmp_path, below):
     assert_same(named, room, names=room.names)
 
 
+def test_what_was_meshed_may_lie_there_alone(tmp_path):
+    room = truth()
+    _write(tmp_path, room, [_part(room)])
+    (tmp_path / "reconstruction.json").rename(tmp_path / "reconstruction.meshed.json")
+    assert_same(read_scan(tmp_path, OPTIONS), room)
+
+
 def test_undistorted_pictures_do_not_go_with_the_original_lens(tmp_path):
     """Where OpenSfM puts those, if nobody has the original ones any more."""
     _write(tmp_path, truth(), [_part(truth(), kind="brown", k1=-0.1)])

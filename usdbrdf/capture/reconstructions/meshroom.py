@@ -19,9 +19,17 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import rigid_pose
-from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, rows_of, scan_of_shots, size_in
+from usdbrdf.capture.reconstructions.shots import (
+    Shot,
+    ShotCamera,
+    files_of_capture,
+    rows_of,
+    scan_of_shots,
+    size_in,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
+from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import beginning_of, files_of, numbers_among
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -41,6 +49,11 @@ _SINCE: dict[str, Version] = {
     "focalLength is the second": (1, 2, 11),
     "newest": (1, 2, 12),
 }
+# Where a project keeps what its nodes have made, those of them that find or turn cameras, and what
+# those make that mesh; beside a document that was taken from there, the same names.
+_CACHE, _NODES = "MeshroomCache", ("StructureFromMotion", "SfMTransform")
+_TEXTURED = (("Texturing", "texturedMesh.obj"), ("MeshFiltering", "mesh.obj"))
+_BESIDE = ("texturedMesh.*", "mesh.*")
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _FULL_FRAME_MM = 36.0
 # Before 1.2.8 the type of a camera said its distortion too.
@@ -50,8 +63,36 @@ _COUNTS = {"none": 0, "radialk1": 1, "radialk3": 3, "brown": 5, "fisheye": 4, "f
 
 
 def matches(path: Path) -> bool:
-    """Such a document, or a folder with one or several of them."""
-    return bool(_documents(path))
+    """Such a document, a folder with one or several of them, or a project's."""
+    return bool(_documents(path) or _in_cache(path))
+
+
+def _in_cache(path: Path) -> list[Path]:
+    """What the nodes that find cameras have left in a project's folder."""
+    cache = path if path.name == _CACHE else path / _CACHE
+    return [file for node in _NODES for file in seen_of(cache.glob(f"{node}/*/cameras.sfm"))]
+
+
+def _home(source: Path) -> Path:
+    """The capture's folder: the project's where the document lies in its cache."""
+    folder = source.parent
+    above = folder.parents[1:3]  # of the node's result and of the node: the cache, the project
+    return above[1] if folder.parent.name in _NODES and above[0].name == _CACHE else folder
+
+
+def beside(path: Path) -> list[Path]:
+    """What lies in a project's folder, where a place in its cache is named."""
+    found = _documents(path.resolve()) or _in_cache(path.resolve())
+    home = _home(found[0]) if found else path.resolve()
+    if home == path.resolve() or not path.resolve().is_relative_to(home):
+        return []
+    return files_of_capture(home, meshes=_meshes(home))
+
+
+def _meshes(home: Path) -> tuple[str, ...]:
+    """Patterns of its own names; those in the cache where one node alone has made one."""
+    made = [f"{_CACHE}/{node}/*/{name}" for node, name in _TEXTURED]
+    return (*_BESIDE, *(pattern for pattern in made if len(list(home.glob(pattern))) == 1))
 
 
 def _documents(path: Path) -> list[Path]:
@@ -64,6 +105,14 @@ def _documents(path: Path) -> list[Path]:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
+    cached = [] if documents else _in_cache(path.resolve())
+    if len(cached) > 1:
+        raise InputRefused(
+            f"{path}: {len(cached)} nodes of the project have found cameras, first "
+            f"{cached[0]}. Name the cameras.sfm of the one that the mesh was made with. "
+            "[capture.format]"
+        )
+    documents = documents or cached
     if not documents:
         raise InputRefused(
             f"{path}: no cameras.sfm. Name the file that the node StructureFromMotion writes. "
@@ -90,8 +139,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         findings,
         adapter=NAME,
         source=source,
-        folder=source.parent,
-        meshes=("texturedMesh.*", "mesh.*"),
+        folder=_home(source),
+        meshes=_meshes(_home(source)),
         how="Put texturedMesh.obj of the node Texturing (or mesh.obj of MeshFiltering) into this "
         "folder",
     )
