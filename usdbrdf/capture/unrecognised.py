@@ -72,6 +72,14 @@ _BY_HAND = "Write a transforms.json of the pictures' poses and lens"
 _EXAMPLE = "the example of an adapter, plugins/example_adapter of our sources"
 _AS_USD = "Export cameras and meshes as USD, and convert that"
 _NOTHING = rb"(?!)"
+
+
+def _rows(numbers: int, least: int) -> bytes:
+    """Of a table of so many numbers a row, with at least so many rows, the first of them."""
+    row = rb"[ \t]*(?:[-+.\deE]+[ \t,]+){%d}[-+.\deE]+[ \t]*\r?\n" % (numbers - 1)
+    return rb"\A(?:%b){%d}" % (row, least)
+
+
 _PROGRAMS = (
     _Program(
         "OpenMVG", ("sfm_data.bin", "sfm_data.xml"), (), _NOTHING,
@@ -249,6 +257,21 @@ _PROGRAMS = (
     _Program("Maya", (".ma", ".mb"), (), _NOTHING, _AS_USD),
     _Program("Cinema 4D", (".c4d",), (), _NOTHING, _AS_USD),
     _Program("Nuke", (".nk", ".chan"), (), _NOTHING, f"Import them into Blender. {_AS_USD}"),
+    # By their numbers alone, so after all that say who wrote them: a row of each camera, or a file.
+    _Program(
+        "KITTI", (), (), _rows(12, 3), f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+    ),
+    _Program(
+        "Replica for NICE-SLAM", (), (), _rows(16, 3),
+        "Call the file traj.txt, and put its pictures into results/ and the mesh beside them",
+    ),
+    _Program(
+        "TUM RGB-D", (), (), _rows(8, 3), f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+    ),
+    _Program(
+        "a data set with a file of each camera", (), (), _rows(4, 3) + rb"[^\n]*\s*\Z",
+        f"{_BY_HAND}, and name the scene's mesh in it",
+    ),
     _Program(
         "COLMAP", (), (), rb"\ASQLite format 3",
         "This database has no poses: have them found with 'colmap mapper'", "database.db",
