@@ -21,6 +21,7 @@ from PIL import Image
 from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from tests.capture import (
+    test_scan_from_arkitscenes,
     test_scan_from_blocks_exchange,
     test_scan_from_bundler,
     test_scan_from_e57,
@@ -461,6 +462,11 @@ def bundler(folder: Path) -> list[Seed]:
 
 def pix4d(folder: Path) -> list[Seed]:
     return _document(folder, test_scan_from_pix4d, test_scan_from_pix4d.PARAMETERS)
+
+
+def arkitscenes(folder: Path) -> list[Seed]:
+    test_scan_from_arkitscenes._write(folder, _room(), frames=".")
+    return _capture(folder, "lowres_wide.traj", "lowres_wide_intrinsics/*.pincam")
 
 
 def opf(folder: Path) -> list[Seed]:

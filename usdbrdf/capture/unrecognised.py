@@ -131,7 +131,7 @@ _PROGRAMS = (
     ),
     _Program(
         "ARKitScenes", (".traj", ".pincam"), (), _NOTHING,
-        f"{_BY_HAND}, and name the scene's mesh in it",
+        "Name the video's folder, which has lowres_wide.traj, lowres_wide/ and its _intrinsics/",
     ),
     _Program(
         "Matterport3D", (), (), rb"(?m)^dataset matterport",
