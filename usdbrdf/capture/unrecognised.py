@@ -73,13 +73,8 @@ _EXAMPLE = "the example of an adapter, plugins/example_adapter of our sources"
 _AS_USD = "Export cameras and meshes as USD, and convert that"
 _NOTHING = rb"(?!)"
 
-
-def _rows(numbers: int, least: int) -> bytes:
-    """Of a table of so many numbers a row, with at least so many rows, the first of them."""
-    row = rb"[ \t]*(?:[-+.\deE]+[ \t,]+){%d}[-+.\deE]+[ \t]*\r?\n" % (numbers - 1)
-    return rb"\A(?:%b){%d}" % (row, least)
-
-
+# The beginning of a table: three rows of one number and so many before it.
+_TABLE = rb"\A(?:[ \t]*(?:[-+.\deE]+[ \t,]+){%b}[-+.\deE]+[ \t]*\r?\n){3}"
 _PROGRAMS = (
     _Program(
         "OpenMVG", ("sfm_data.bin", "sfm_data.xml"), (), _NOTHING,
@@ -259,17 +254,17 @@ _PROGRAMS = (
     _Program("Nuke", (".nk", ".chan"), (), _NOTHING, f"Import them into Blender. {_AS_USD}"),
     # By their numbers alone, so after all that say who wrote them: a row of each camera, or a file.
     _Program(
-        "KITTI", (), (), _rows(12, 3), f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+        "KITTI", (), (), _TABLE % b"11", f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
     ),
     _Program(
-        "Replica for NICE-SLAM", (), (), _rows(16, 3),
+        "Replica for NICE-SLAM", (), (), _TABLE % b"15",
         "Call the file traj.txt, and put its pictures into results/ and the mesh beside them",
     ),
     _Program(
-        "TUM RGB-D", (), (), _rows(8, 3), f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+        "TUM RGB-D", (), (), _TABLE % b"7", f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
     ),
     _Program(
-        "a data set with a file of each camera", (), (), _rows(4, 3) + rb"[^\n]*\s*\Z",
+        "a data set with a file of each camera", (), (), _TABLE % b"3" + rb"[^\n]*\s*\Z",
         f"{_BY_HAND}, and name the scene's mesh in it",
     ),
     _Program(

@@ -40,7 +40,7 @@ _MESHES = ("*_3dod_mesh.ply", "mesh.*")
 _COUNTS = 7, 6  # numbers of a pose with its time, and of a .pincam
 # Between the times of a picture and of its pose, as the data set's own tools have it; and of a
 # picture and its camera, whose names are rounded apart.
-_APART, _ROUNDED = 0.005, 0.0015
+_BETWEEN, _ROUNDED = 0.005, 0.0015
 
 
 def matches(path: Path) -> bool:
@@ -117,7 +117,7 @@ def shots_of(source: Path, options: CaptureOptions, findings: Findings) -> list[
         _by_time(list(pictures_of(folder, options, *places).paths)).items()
     ):
         pose = poses[np.abs(poses[:, 0] - time).argmin()]
-        if abs(pose[0] - time) > _APART:
+        if abs(pose[0] - time) > _BETWEEN:
             apart += 1
             continue
         nearest = min(cameras, key=lambda other: abs(other - time), default=np.inf)
