@@ -157,6 +157,16 @@ def test_every_model_becomes_the_lens_that_pycolmap_has():
         np.testing.assert_allclose(found, camera.img_from_cam(directions), atol=1e-6, err_msg=name)
 
 
+@pytest.mark.parametrize("gone", ["rigs", "frames"])
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_images_have_poses_where_one_of_rigs_and_frames_is_gone(tmp_path, gone, suffix):
+    made = colmap_capture(tmp_path, "PINHOLE", text=suffix == ".txt")
+    whole = read_scan(tmp_path, OPTIONS)
+    (made.folder / "sparse/0" / f"{gone}{suffix}").unlink()
+    one = read_scan(tmp_path, OPTIONS)
+    np.testing.assert_allclose(one.frames.world_from_camera, whole.frames.world_from_camera)
+
+
 def test_several_cameras_in_subfolders_with_missing_images(tmp_path):
     made = make_capture(tmp_path / "room")
     names = [f"{'left' if i % 2 else 'right é'}/{i // 2:02d}.exr" for i in range(12)]

@@ -4,9 +4,11 @@ dialects of its versions."""
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.format_truth import (
     HEIGHT,
@@ -21,8 +23,8 @@ from tests.format_truth import (
     write_obj,
 )
 from usdbrdf.capture.adapters import choose_adapter, read_scan
-from usdbrdf.capture.reconstructions.meshroom import shots_of
-from usdbrdf.errors import InputRefused
+from usdbrdf.capture.reconstructions.meshroom import beside, shots_of
+from usdbrdf.errors import InputRefused, MeshMissing
 from usdbrdf.options import IngestOptions
 
 OPTIONS = IngestOptions(assume_srgb=True)
@@ -110,6 +112,55 @@ def test_every_version_is_the_room(tmp_path, version):
     assert scan.adapter == "meshroom"
 
 
+def _project(folder, room):
+    """As Meshroom leaves it: what its nodes have made lies in a cache, by their results' hashes."""
+    _write(folder, room, _document(room))
+    (folder / "room.mg").write_text('{"header": {"fileVersion": "1.1"}, "graph": {}}')
+    photographs = _document(room) | {"poses": []}
+    for node, file, made in (
+        ("CameraInit", "cameraInit.sfm", json.dumps(photographs)),
+        ("StructureFromMotion", "cameras.sfm", (folder / "cameras.sfm").read_text()),
+        ("Texturing", "texturedMesh.obj", (folder / "texturedMesh.obj").read_text()),
+    ):
+        place = folder / "MeshroomCache" / node / "5ac2b90d"
+        place.mkdir(parents=True)
+        (place / file).write_text(made)
+    (folder / "cameras.sfm").unlink()
+    (folder / "texturedMesh.obj").unlink()
+    return folder
+
+
+@pytest.mark.parametrize(
+    "named",
+    [
+        ".", "MeshroomCache", "MeshroomCache/StructureFromMotion/5ac2b90d",
+        "MeshroomCache/StructureFromMotion/5ac2b90d/cameras.sfm",
+    ],
+)  # fmt: skip
+def test_a_whole_project_is_read_from_its_cache(tmp_path, named):
+    room = truth()
+    project = _project(tmp_path, room)
+    scan = read_scan(project / named, OPTIONS)
+    poses = np.diag([*OPENGL, 1.0]) @ room.world_from_camera[_order()]
+    assert_same(scan, room, points=room.points * OPENGL, poses=poses)
+    read = {file.name for file in beside(project / named)}
+    assert read == (set() if named == "." else {"texturedMesh.obj", *_names()})
+
+
+def _names():
+    return {f"{i:04d}.jpg" for i in range(5)}
+
+
+def test_of_several_results_nobody_knows_which_belong_together(tmp_path):
+    cache = _project(tmp_path, truth()) / "MeshroomCache"
+    shutil.copytree(cache / "Texturing/5ac2b90d", cache / "Texturing/77")
+    with pytest.raises(MeshMissing, match="or name one with --mesh"):
+        read_scan(tmp_path, OPTIONS)
+    shutil.copytree(cache / "StructureFromMotion/5ac2b90d", cache / "StructureFromMotion/77")
+    with pytest.raises(InputRefused, match="2 nodes of the project have found cameras"):
+        read_scan(tmp_path, OPTIONS)
+
+
 def _fov(plane, terms):
     r = np.hypot(*plane)
     bent = np.arctan(2 * r * np.tan(terms[0] / 2)) / terms[0]
@@ -153,14 +204,53 @@ def test_cameras_that_are_not_read_are_named(tmp_path, change, words):
     assert [word for word in words if word not in str(refused.value)] == []
 
 
-def test_views_of_a_rig_and_without_a_pose_are_left_out(tmp_path):
+def _pose3(camera_from_world):
+    """As savePose3 writes it."""
+    rotation = camera_from_world[:3, :3]
+    return {"rotation": _texts(rotation), "center": _texts(-rotation.T @ camera_from_world[:3, 3])}
+
+
+def _in_rigs(document, room, *, says):
+    """Views by twos in a rig; each pair's pose is the rig's, from which both cameras are turned and
+    moved (SfMData::getPose: sub-pose after rig). ``says`` is isPoseIndependant of its cameras."""
+    turn = Rotation.from_euler("xyz", (20, -35, 50), degrees=True).as_matrix()
+    for i in range(0, 10, 2):
+        subs = []
+        rig_from_world = np.eye(4)
+        rig_from_world[:3, :3], rig_from_world[:3, 3] = turn, (0.3, -0.2, 0.5 + i)
+        for k in (0, 1):
+            camera_from_world = np.linalg.inv(room.opencv[i + k])
+            sub = _pose3(camera_from_world @ np.linalg.inv(rig_from_world))
+            subs.append({"status": "estimated", "pose": sub})
+            document["views"][i + k] |= {
+                "poseId": str(900 + i), "rigId": str(50 + i), "subPoseId": str(k),
+            } | says  # fmt: skip
+        document.setdefault("rigs", []).append({"rigId": str(50 + i), "subPoses": subs})
+        document["poses"].append(
+            {"poseId": str(900 + i), "pose": {"transform": _pose3(rig_from_world), "locked": "0"}}
+        )
+    document["poses"] = document["poses"][10:]
+    return document
+
+
+@pytest.mark.parametrize("says", [{"isPoseIndependant": "false"}, {}])
+def test_cameras_of_a_rig_stand_where_its_pose_and_their_own_in_it_say(tmp_path, says):
+    room = truth()
+    _write(tmp_path, room, _in_rigs(_document(room), room, says=says))
+    scan = read_scan(tmp_path, OPTIONS)
+    poses = np.diag([*OPENGL, 1.0]) @ room.world_from_camera[_order()]
+    assert_same(scan, room, points=room.points * OPENGL, poses=poses)
+
+
+def test_views_that_no_rig_places_and_without_a_pose_are_left_out(tmp_path):
     room, document = truth(), _document(truth())
     document["views"][2] |= {"rigId": "5", "subPoseId": "0", "isPoseIndependant": "false"}
+    document["rigs"] = [{"rigId": "5", "subPoses": [{"status": "uninitialized"}]}]
     del document["poses"][4]
     _write(tmp_path, room, document)
     scan = read_scan(tmp_path, OPTIONS)
     assert len(scan.frames) == 8
-    assert any("it is one of a rig" in said for said in scan.warnings)
+    assert any("nothing says where it stands in its rig" in said for said in scan.warnings)
 
 
 @pytest.mark.parametrize("version", [None, ["1", "x", "0"], "1.2.11"])

@@ -153,6 +153,12 @@ def test_a_mesh_that_is_not_read_is_named(tmp_path):
         read_scan(tmp_path, OPTIONS)
 
 
+def test_a_distortion_that_is_not_known_is_refused(tmp_path):
+    _write(tmp_path, truth(), _document(truth(), disto_k9=[0.1, 0]))
+    with pytest.raises(InputRefused, match="disto_k9 of a camera is a distortion"):
+        read_scan(tmp_path, OPTIONS)
+
+
 def test_a_distortion_of_too_few_numbers_is_refused(tmp_path):
     _write(tmp_path, truth(), _document(truth(), disto_t2=[0.1, 0]))
     with pytest.raises(InputRefused, match="disto_t2 of a camera is not 5"):

@@ -64,6 +64,22 @@ def test_the_largest_reconstruction_is_the_room(tmp_path, below):
     assert_same(named, room, names=room.names)
 
 
+def test_what_was_meshed_may_lie_there_alone(tmp_path):
+    room = truth()
+    _write(tmp_path, room, [_part(room)])
+    (tmp_path / "reconstruction.json").rename(tmp_path / "reconstruction.meshed.json")
+    assert_same(read_scan(tmp_path, OPTIONS), room)
+
+
+def test_undistorted_pictures_do_not_go_with_the_original_lens(tmp_path):
+    """Where OpenSfM puts those, if nobody has the original ones any more."""
+    _write(tmp_path, truth(), [_part(truth(), kind="brown", k1=-0.1)])
+    (tmp_path / "undistorted").mkdir()
+    (tmp_path / "images").rename(tmp_path / "undistorted/images")
+    with pytest.raises(InputRefused, match=r"bends light.*\[capture.camera\]"):
+        read_scan(tmp_path, OPTIONS)
+
+
 def test_a_folder_may_be_called_opensfm(tmp_path):
     """Which alone does not make it a part of OpenDroneMap's."""
     folder, room = tmp_path / "opensfm", truth()

@@ -27,8 +27,8 @@ DOCUMENTS = [
     ("groundtruth.txt", "# ground truth trajectory\n", "TUM RGB-D", "a transforms.json"),
     ("run.txt", "#\n# timestamp tx ty tz qx qy qz qw\n", "TUM RGB-D", "fuse the depths"),
     ("frame-000000.pose.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "7-Scenes", "fuse the"),
-    ("lowres_wide.traj", "1.5 0.1 0.2 0.3 0 0 0\n", "ARKitScenes", "a transforms.json"),
-    ("41254.1_2.pincam", "256 192 211 211 128 96\n", "ARKitScenes", "a transforms.json"),
+    ("color.traj", "1.5 0.1 0.2 0.3 0 0 0\n", "ARKitScenes", "the video's folder"),
+    ("41254.1_2.pincam", "256 192 211 211 128 96\n", "ARKitScenes", "the video's folder"),
     ("house.conf", "dataset matterport\nn_images 90\n", "Matterport3D", "the scene's mesh"),
     ("cameras.json", '[{"id": 0, "img_name": "1"}]', "Gaussian splatting", "trained on"),
     ("meta_data.json", '{"frames": [{"camtoworld": []}]}', "SDFStudio", "COLMAP"),
@@ -89,6 +89,10 @@ DOCUMENTS = [
     ("shot.ma", "//Maya ASCII 2024 scene\n", "Maya", "as USD"),
     ("shot.c4d", "QC4D", "Cinema 4D", "as USD"),
     ("shot.chan", "1 0 0 0 0 0 0 50\n", "Nuke", "as USD"),
+    ("00.txt", 3 * "1e0 0 0 0 0 1 0 0 0 0 1 0\n", "KITTI", "a transforms.json"),
+    ("trajectory_gt.txt", 3 * f"{'1.5 ' * 16}\n", "Replica for NICE-SLAM", "traj.txt"),
+    ("groundtruth.txt", 3 * "1311868164.36 0 0 0 0 0 0 1\r\n", "TUM RGB-D", "fuse the"),
+    ("0007.txt", 4 * "1 0 -0.5 1e-3\n", "a data set with a file of each camera", "in it"),
     ("database.db", "SQLite format 3\x00", "COLMAP", "colmap mapper"),
 ]
 
@@ -129,6 +133,12 @@ def test_a_document_that_names_no_program_is_none_of_theirs(tmp_path):
     document.write_text(json.dumps({"quality": "high"}))
     assert "neither pictures nor cameras" in _refused(tmp_path)
     assert "this is not a transforms.json" in _refused(document)
+
+
+def test_tables_of_other_numbers_are_no_cameras(tmp_path):
+    for name, row in (("points.xyz", "1 2 3\n"), ("weights.txt", "1 0 0 0\n")):
+        (tmp_path / name).write_text(row * 5)
+    assert "neither pictures nor cameras" in _refused(tmp_path)
 
 
 def test_documents_that_only_look_like_theirs_are_not(tmp_path):

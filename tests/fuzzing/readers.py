@@ -320,7 +320,7 @@ READERS = {
                 photographs=True,
                 lines=(f"usdbrdf.capture.reconstructions.{name.replace('-', '_')}",),
             )
-            for name in ("blocks-exchange", "bundler", "pix4d", "visualsfm")
+            for name in ("arkitscenes", "blocks-exchange", "bundler", "opf", "pix4d", "visualsfm")
         ),
         _of_capture("e57", photographs=True),
         _of_capture(

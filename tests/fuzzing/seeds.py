@@ -21,6 +21,7 @@ from PIL import Image
 from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from tests.capture import (
+    test_scan_from_arkitscenes,
     test_scan_from_blocks_exchange,
     test_scan_from_bundler,
     test_scan_from_e57,
@@ -28,6 +29,7 @@ from tests.capture import (
     test_scan_from_fipt,
     test_scan_from_llff,
     test_scan_from_metashape,
+    test_scan_from_opf,
     test_scan_from_pix4d,
     test_scan_from_realityscan,
     test_scan_from_replica,
@@ -460,6 +462,17 @@ def bundler(folder: Path) -> list[Seed]:
 
 def pix4d(folder: Path) -> list[Seed]:
     return _document(folder, test_scan_from_pix4d, test_scan_from_pix4d.PARAMETERS)
+
+
+def arkitscenes(folder: Path) -> list[Seed]:
+    test_scan_from_arkitscenes._write(folder, _room(), frames=".")
+    return _capture(folder, "lowres_wide.traj", "lowres_wide_intrinsics/*.pincam")
+
+
+def opf(folder: Path) -> list[Seed]:
+    room = _room().square()
+    test_scan_from_opf._write(folder, room, test_scan_from_opf._documents(room))
+    return _capture(folder, "room.opf", "parts/*.json")
 
 
 def visualsfm(folder: Path) -> list[Seed]:

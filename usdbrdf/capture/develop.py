@@ -205,18 +205,14 @@ def with_rims(
     """Records of which those that lie in a folder of undistorted pictures, and whose cameras bend
     nothing, have a rim if some of them are black in a corner.
 
-    places  the capture's folder, and the user's of the pictures: the names of folders below that
-            say what these are; of the user's elsewhere its own and the next, as what a whole
-            project is called says nothing
+    places  as of ``is_called_undistorted``
     """
-    folder, frames = places
-    folders = [folder, *([] if frames is None else frames.resolve().parents[:2][-1:])]
     if any(record.rim for record in records):
         return list(records)
     undistorted = [
         record.image_path
         for record in records
-        if not record.lens.bends and _is_called_undistorted(record.image_path, folders)
+        if not record.lens.bends and is_called_undistorted(record.image_path, places)
     ]
     some = spread_evenly(len(undistorted), _PROBED_PICTURES)
     if not any(_is_black_in_a_corner(undistorted[i]) for i in some):
@@ -229,7 +225,15 @@ def with_rims(
     return [replace(record, rim=record.image_path in concerned) for record in records]
 
 
-def _is_called_undistorted(picture: Path, folders: Sequence[Path]) -> bool:
+def is_called_undistorted(picture: Path, places: tuple[Path, Path | None]) -> bool:
+    """Whether a folder that a picture lies in is called so.
+
+    places  the capture's folder, and the user's of the pictures: the names of folders below that
+            say what these are; of the user's elsewhere its own and the next, as what a whole
+            project is called says nothing
+    """
+    folder, frames = places
+    folders = [folder, *([] if frames is None else frames.resolve().parents[:2][-1:])]
     home = next((folder for folder in folders if picture.is_relative_to(folder)), None)
     names = picture.relative_to(home).parent.parts if home else (picture.parent.name,)
     return any("undistort" in name.lower() for name in names)

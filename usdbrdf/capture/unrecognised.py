@@ -72,6 +72,9 @@ _BY_HAND = "Write a transforms.json of the pictures' poses and lens"
 _EXAMPLE = "the example of an adapter, plugins/example_adapter of our sources"
 _AS_USD = "Export cameras and meshes as USD, and convert that"
 _NOTHING = rb"(?!)"
+
+# The beginning of a table: three rows of one number and so many before it.
+_TABLE = rb"\A(?:[ \t]*(?:[-+.\deE]+[ \t,]+){%b}[-+.\deE]+[ \t]*\r?\n){3}"
 _PROGRAMS = (
     _Program(
         "OpenMVG", ("sfm_data.bin", "sfm_data.xml"), (), _NOTHING,
@@ -123,7 +126,7 @@ _PROGRAMS = (
     ),
     _Program(
         "ARKitScenes", (".traj", ".pincam"), (), _NOTHING,
-        f"{_BY_HAND}, and name the scene's mesh in it",
+        "Name the video's folder, which has lowres_wide.traj, lowres_wide/ and its _intrinsics/",
     ),
     _Program(
         "Matterport3D", (), (), rb"(?m)^dataset matterport",
@@ -168,6 +171,10 @@ _PROGRAMS = (
     _Program(
         "Pix4D", (".p4d", "camera_parameters.txt", "camera_parameters.cam", "pmatrix.txt"), (),
         _NOTHING, "Bring the project's 1_initial/params/*_calibrated_camera_parameters.txt",
+    ),
+    _Program(
+        "PIX4Dmatic", (), (), rb'"application/opf-(?!project)',
+        "Name the project's folder, which has its .opf",
     ),
     _Program(
         "OpenDroneMap", ("shots.geojson",), (), _NOTHING,
@@ -245,6 +252,21 @@ _PROGRAMS = (
     _Program("Maya", (".ma", ".mb"), (), _NOTHING, _AS_USD),
     _Program("Cinema 4D", (".c4d",), (), _NOTHING, _AS_USD),
     _Program("Nuke", (".nk", ".chan"), (), _NOTHING, f"Import them into Blender. {_AS_USD}"),
+    # By their numbers alone, so after all that say who wrote them: a row of each camera, or a file.
+    _Program(
+        "KITTI", (), (), _TABLE % b"11", f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+    ),
+    _Program(
+        "Replica for NICE-SLAM", (), (), _TABLE % b"15",
+        "Call the file traj.txt, and put its pictures into results/ and the mesh beside them",
+    ),
+    _Program(
+        "TUM RGB-D", (), (), _TABLE % b"7", f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+    ),
+    _Program(
+        "a data set with a file of each camera", (), (), _TABLE % b"3" + rb"[^\n]*\s*\Z",
+        f"{_BY_HAND}, and name the scene's mesh in it",
+    ),
     _Program(
         "COLMAP", (), (), rb"\ASQLite format 3",
         "This database has no poses: have them found with 'colmap mapper'", "database.db",

@@ -13,6 +13,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from usdbrdf.model.arrays import Array
 MAX_BYTES = 256 << 20
 MAX_DEPTH = 64
 _MAX_ARRAY_BYTES = 4 << 30  # of one that is stored smaller
-_INTEGER_LIMIT = 1 << 63
+_INTEGER_LIMIT, _UNSIGNED_LIMIT = 1 << 63, 1 << 64
 _HALF_A_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # or half of a whole one
 # What XML may say that it is written in, of what has a letter in each byte.
 _OF_ONE_BYTE = re.compile(
@@ -46,13 +47,16 @@ class _KeyTwice(ValueError):
     """An object names one key two times."""
 
 
-def read_json(path: Path, *, nonfinite_below: Collection[str] = ()) -> Any:
+def read_json(path: Path, *, nonfinite_below: Collection[str] = (), unsigned: bool = False) -> Any:
     """Parse a JSON document strictly; InputRefused names the file and, where known, the line.
 
     ``json`` alone would take NaN, turn 1e999 into infinity and keep the last of two equal keys.
 
     nonfinite_below  keys whose values may hold NaN and infinities, for the caller to judge
+    unsigned         whether whole numbers may be such of 64 bits without a sign, as what stands for
+                     a picture's content often is
     """
+    integer = partial(_integer, limit=_UNSIGNED_LIMIT if unsigned else _INTEGER_LIMIT)
     text = read_text(path)
     too_deep = InputRefused(
         f"{path}: nested deeper than {MAX_DEPTH} levels. This is not a document of ours; check "
@@ -60,9 +64,9 @@ def read_json(path: Path, *, nonfinite_below: Collection[str] = ()) -> Any:
     )
     try:
         try:
-            document = _parsed(text, _finite)
+            document = _parsed(text, _finite, integer)
         except _BadNumber:
-            document = _parsed(text, float)
+            document = _parsed(text, float, integer)
             if _any_nonfinite(document, nonfinite_below):
                 raise
     except (_BadNumber, _KeyTwice) as error:
@@ -153,13 +157,13 @@ def encoding_of_text(content: bytes) -> str:
     return declared[1].decode().lower() if declared else "utf-8-sig"
 
 
-def _parsed(text: str, number: Callable[[str], float]) -> Any:
+def _parsed(text: str, number: Callable[[str], float], integer: Callable[[str], int]) -> Any:
     return json.loads(
         text,
         object_pairs_hook=_object_without_key_twice,
         parse_constant=number,
         parse_float=number,
-        parse_int=_integer,
+        parse_int=integer,
     )
 
 
@@ -187,9 +191,9 @@ def _finite(token: str) -> float:
     return value
 
 
-def _integer(token: str) -> int:
-    # 19 digits and a sign always fit int(); longer ones may exceed Python's own digit limit.
-    if len(token) > 20 or not -_INTEGER_LIMIT <= int(token) < _INTEGER_LIMIT:
+def _integer(token: str, *, limit: int) -> int:
+    # 20 digits always fit int(); longer ones may exceed Python's own digit limit.
+    if len(token) > 20 or not -_INTEGER_LIMIT <= int(token) < limit:
         raise _BadNumber(token)
     return int(token)
 

@@ -49,11 +49,14 @@ class ColmapModel:
 
 
 def model_files(folder: Path) -> tuple[Path, ...]:
-    """The files of the model that lies in a folder, cameras and images first; () if none does."""
+    """The files of the model that lies in a folder, cameras and images first; () if none does. Of
+    rigs and frames one means nothing without the other, and images have poses without both."""
     for suffix in _SUFFIXES:
-        files = [folder / f"{name}{suffix}" for name in (*_NEEDED, *_NEWER)]
-        if all(file.is_file() for file in files[: len(_NEEDED)]):
-            return tuple(file for file in files if file.is_file())
+        needed, newer = (
+            tuple(folder / f"{name}{suffix}" for name in names) for names in (_NEEDED, _NEWER)
+        )
+        if all(file.is_file() for file in needed):
+            return (*needed, *newer) if all(file.is_file() for file in newer) else needed
     return ()
 
 

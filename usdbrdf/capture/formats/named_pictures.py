@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
-from usdbrdf.capture.develop import with_rims
+from usdbrdf.capture.develop import is_called_undistorted, with_rims
 from usdbrdf.capture.parts import (
     LabelTable,
     as_photographs,
@@ -340,8 +340,8 @@ def _names_without_suffix(name: str) -> tuple[str, ...]:
 
 
 def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None:
-    """The mask of a picture in masks/: of its name there (in subfolders too), with or without its
-    suffix, as programs have it; black is what is not to be looked at."""
+    """The mask of a picture in masks/, of its name there (in subfolders too), with its suffix or
+    not; black is what is not to be looked at."""
     stem = str(PurePosixPath(name).with_suffix(""))
     for usual in (name, stem, f"{stem}_mask", f"{name}.mask"):
         for suffix in _MASK_SUFFIXES:
@@ -409,12 +409,12 @@ def scan_of(
 
     objects   what knows the objects of the mesh; ``--objects`` comes first
     source    the document that messages name; ``folder``, the capture's own, absolute
-    encoding  of the images, where the format says; the user's comes first. InputRefused where these
-              hold something of another kind
+    encoding  of the images, where the format says, which are to be of that kind; the user's first
     radiometric  False of linear images that 8-bit photographs became
     """
     for record in records:
-        if record.lens.bends and "undistort" in record.image_path.parent.name.lower():
+        called = is_called_undistorted(record.image_path, (folder, options.frames))
+        if record.lens.bends and (called or "undistort" in record.image_path.parent.name.lower()):
             raise InputRefused(
                 f"{record.image_path}: a picture that has been undistorted, but the lens of "
                 f"{record.name!r} in {source.name} bends light. Bring the original pictures, or "

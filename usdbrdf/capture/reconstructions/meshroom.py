@@ -4,11 +4,13 @@ Meshing, MeshFiltering or Texturing.
 A pose is the camera's centre and the rotation from the world to it (OpenCV's axes), column by
 column. Numbers are texts. Focal lengths are in mm of a sensor whose width is stated, older ones in
 pixels; how the second follows from the first has changed with the document's version. So has the
-frame of exported meshes: since 1.2.3 their y and z are those of the cameras, negated.
+frame of exported meshes: since 1.2.3 their y and z are those of the cameras, negated. Of a rig the
+pose is the rig's, and each camera has its own within it.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,17 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import rigid_pose
-from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, rows_of, scan_of_shots, size_in
+from usdbrdf.capture.reconstructions.shots import (
+    Shot,
+    ShotCamera,
+    files_of_capture,
+    rows_of,
+    scan_of_shots,
+    size_in,
+)
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
+from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import beginning_of, files_of, numbers_among
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -39,6 +49,11 @@ _SINCE: dict[str, Version] = {
     "focalLength is the second": (1, 2, 11),
     "newest": (1, 2, 12),
 }
+# Where a project keeps what its nodes have made, those of them that find or turn cameras, and what
+# those make that mesh; beside a document that was taken from there, the same names.
+_CACHE, _NODES = "MeshroomCache", ("StructureFromMotion", "SfMTransform")
+_TEXTURED = (("Texturing", "texturedMesh.obj"), ("MeshFiltering", "mesh.obj"))
+_BESIDE = ("texturedMesh.*", "mesh.*")
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _FULL_FRAME_MM = 36.0
 # Before 1.2.8 the type of a camera said its distortion too.
@@ -48,8 +63,36 @@ _COUNTS = {"none": 0, "radialk1": 1, "radialk3": 3, "brown": 5, "fisheye": 4, "f
 
 
 def matches(path: Path) -> bool:
-    """Such a document, or a folder with one or several of them."""
-    return bool(_documents(path))
+    """Such a document, a folder with one or several of them, or a project's."""
+    return bool(_documents(path) or _in_cache(path))
+
+
+def _in_cache(path: Path) -> list[Path]:
+    """What the nodes that find cameras have left in a project's folder."""
+    cache = path if path.name == _CACHE else path / _CACHE
+    return [file for node in _NODES for file in seen_of(cache.glob(f"{node}/*/cameras.sfm"))]
+
+
+def _home(source: Path) -> Path:
+    """The capture's folder: the project's where the document lies in its cache."""
+    folder = source.parent
+    above = folder.parents[1:3]  # of the node's result and of the node: the cache, the project
+    return above[1] if folder.parent.name in _NODES and above[0].name == _CACHE else folder
+
+
+def beside(path: Path) -> list[Path]:
+    """What lies in a project's folder, where a place in its cache is named."""
+    found = _documents(path.resolve()) or _in_cache(path.resolve())
+    home = _home(found[0]) if found else path.resolve()
+    if home == path.resolve() or not path.resolve().is_relative_to(home):
+        return []
+    return files_of_capture(home, meshes=_meshes(home))
+
+
+def _meshes(home: Path) -> tuple[str, ...]:
+    """Patterns of its own names; those in the cache where one node alone has made one."""
+    made = [f"{_CACHE}/{node}/*/{name}" for node, name in _TEXTURED]
+    return (*_BESIDE, *(pattern for pattern in made if len(list(home.glob(pattern))) == 1))
 
 
 def _documents(path: Path) -> list[Path]:
@@ -62,6 +105,14 @@ def _documents(path: Path) -> list[Path]:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
+    cached = [] if documents else _in_cache(path.resolve())
+    if len(cached) > 1:
+        raise InputRefused(
+            f"{path}: {len(cached)} nodes of the project have found cameras, first "
+            f"{cached[0]}. Name the cameras.sfm of the one that the mesh was made with. "
+            "[capture.format]"
+        )
+    documents = documents or cached
     if not documents:
         raise InputRefused(
             f"{path}: no cameras.sfm. Name the file that the node StructureFromMotion writes. "
@@ -88,8 +139,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         findings,
         adapter=NAME,
         source=source,
-        folder=source.parent,
-        meshes=("texturedMesh.*", "mesh.*"),
+        folder=_home(source),
+        meshes=_meshes(_home(source)),
         how="Put texturedMesh.obj of the node Texturing (or mesh.obj of MeshFiltering) into this "
         "folder",
     )
@@ -112,27 +163,51 @@ def shots_of(document: object, version: Version, source: Path) -> list[Shot]:
         str(row.get("intrinsicId")): _camera(row, version, source)
         for row in rows_of(document, "intrinsics")
     }
-    poses = {str(row.get("poseId")): _pose(row, version) for row in rows_of(document, "poses")}
+    turn = _OPENGL if version >= _SINCE["meshes in OpenGL's frame"] else np.eye(3)
+    poses = {str(row.get("poseId")): _pose(row, turn) for row in rows_of(document, "poses")}
+    rig_from_camera = {
+        (str(row.get("rigId")), str(number)): _pose_in_rig(place)
+        for row in rows_of(document, "rigs")
+        for number, place in enumerate(rows_of(row, "subPoses"))
+    }
+    views = rows_of(document, "views")
+    shared = Counter(str(view.get("poseId")) for view in views)
     found = []
-    for view in rows_of(document, "views"):
+    for view in views:
+        pose, problem = poses.get(str(view.get("poseId"))), ""
         # Of a rig one pose is that of all its cameras, unless each has its own.
-        apart = str(view.get("isPoseIndependant", "true")).lower() in ("true", "1")
-        of_rig = "rigId" in view and not (apart and str(view.get("poseId")) in poses)
+        together = "true" if shared[str(view.get("poseId"))] == 1 else "false"
+        apart = str(view.get("isPoseIndependant", together)).lower() in ("true", "1")
+        if "rigId" in view and not apart and pose is not None:
+            place = rig_from_camera.get((str(view["rigId"]), str(view.get("subPoseId"))))
+            problem = "nothing says where it stands in its rig" if place is None else ""
+            pose = pose if place is None else pose @ place
         found.append(
             Shot(
                 name=str(view.get("path") or view.get("viewId")),
                 camera=cameras.get(str(view.get("intrinsicId"))),
-                world_from_camera=poses.get(str(view.get("poseId"))),
-                problem="it is one of a rig, whose poses are not read" if of_rig else "",
+                world_from_camera=pose,
+                problem=problem,
             )
         )
     return found
 
 
-def _pose(row: dict[str, Any], version: Version) -> Double | None:
+def _pose_in_rig(place: dict[str, Any]) -> Double | None:
+    """(4, 4) from a camera of a rig to it; None where that was never found."""
+    if str(place.get("status", "")).lower() == "uninitialized":
+        return None
+    return _rigid(place.get("pose"), np.eye(3))
+
+
+def _pose(row: dict[str, Any], turn: Double) -> Double | None:
     """(4, 4) world from camera, in the frame of the meshes."""
     holder = row.get("pose")
-    stated = holder.get("transform") if isinstance(holder, dict) else None
+    return _rigid(holder.get("transform") if isinstance(holder, dict) else None, turn)
+
+
+def _rigid(stated: object, turn: Double) -> Double | None:
+    """(4, 4) of a rotation and a centre, turned; None where there are none."""
     if not isinstance(stated, dict):
         return None
     rotation, centre = (
@@ -141,7 +216,6 @@ def _pose(row: dict[str, Any], version: Version) -> Double | None:
     )
     if rotation is None or centre is None:
         return None
-    turn = _OPENGL if version >= _SINCE["meshes in OpenGL's frame"] else np.eye(3)
     # Column by column of what turns the world: row by row of what turns the camera.
     return rigid_pose(turn @ rotation.reshape(3, 3), turn @ centre)
 

@@ -129,6 +129,12 @@ def _camera(data: dict[str, Any], source: Path) -> ShotCamera | None:
 
 def _lens(data: dict[str, Any], source: Path) -> Lens:
     named = next((name for name in _COUNTS if name in data), None)
+    if unknown := [name for name in data if name.startswith("disto") and name not in _COUNTS]:
+        raise InputRefused(
+            f"{source}: {unknown[0][:40]} of a camera is a distortion that is not known (known: "
+            f"{', '.join(_COUNTS)}). Undistort the pictures with OpenMVG, and name the document of "
+            "these. [capture.camera]"
+        )
     if named is None:
         return Lens()
     numbers = numbers_among(data[named], _COUNTS[named])

@@ -32,8 +32,8 @@ from usdbrdf.options import CaptureOptions
 
 NAME = "opensfm"
 DESCRIPTION = DESCRIPTIONS[NAME]
-# Where it lies in a project of OpenSfM, and in one of OpenDroneMap.
-_PLACES = ("reconstruction.json", "opensfm/reconstruction.json")
+# Where it lies in a project of OpenSfM, and in one of OpenDroneMap; with a mesh of each photograph.
+_PLACES = ("reconstruction.json", "opensfm/reconstruction.json", "reconstruction.meshed.json")
 _MESHES = ("mesh.*", "odm_texturing/odm_textured_model.obj", "odm_meshing/odm_mesh.ply")
 _SPHERES = ("spherical", "equirectangular")
 # Radial terms of each projection. Tangential and prism terms are 0 where it has none.
