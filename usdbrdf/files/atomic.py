@@ -300,7 +300,8 @@ def raise_shortage(error: BaseException | None) -> None:
     so that those before it are looked at too."""
     while error is not None:
         if isinstance(error, Exception) and not isinstance(error, PermissionError):
-            if (failure := failure_of_machine(error)) is not None:
+            failure = failure_of_machine(error)
+            if failure is not None:
                 raise failure from error
         error = error.__cause__ or error.__context__
 
