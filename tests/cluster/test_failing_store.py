@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -17,7 +20,7 @@ from tests.cluster.object_server import BUCKET, disturbed, let_us_in, running_se
 from usdbrdf.cluster import object_store
 from usdbrdf.cluster.object_store import files_at
 from usdbrdf.cluster.store import Store
-from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.errors import EnvironmentFailure, UsageError
 
 ARRAY = np.arange(100_000.0)
 
@@ -183,6 +186,31 @@ def test_settings_of_a_user_count_by_either_name_of_the_store(
         assert isinstance(files, object_store.Objects)
         assert files._system.config_kwargs["read_timeout"] == 77
         assert files._system.config_kwargs["connect_timeout"] == 5
+
+
+@pytest.mark.parametrize("own", ["{no JSON", [1]])
+def test_settings_of_a_user_that_are_no_table_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: object
+) -> None:
+    pytest.importorskip("s3fs", reason="s3fs is not installed")
+    from fsspec.config import conf
+
+    monkeypatch.setitem(conf, "s3", {"config_kwargs": own})
+    with pytest.raises(UsageError, match=r"FSSPEC_S3_CONFIG_KWARGS.+\[cluster\.settings\]$"):
+        files_at(f"s3://{BUCKET}/prefix", tmp_path)
+
+
+def test_a_file_of_settings_that_is_no_json_is_named(tmp_path: Path) -> None:
+    (tmp_path / "conf.json").write_text("{no JSON")
+    program = "from usdbrdf.cluster.object_store import refuse_unknown; refuse_unknown('s3://a')"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False,
+        env={**os.environ, "FSSPEC_CONFIG_DIR": str(tmp_path)},
+    )  # fmt: skip
+    said = done.stderr.splitlines()[-1]
+    assert said.startswith("usdbrdf.errors.UsageError: ")
+    assert str(tmp_path) in said
+    assert said.endswith("[cluster.settings]")
 
 
 def test_a_store_that_never_answers_is_said_within_a_minute(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import zipfile
 
 import numpy as np
@@ -98,3 +99,15 @@ def test_what_the_machine_lacks_is_no_damage(tmp_path, monkeypatch):
                 with pytest.raises(EnvironmentFailure, match=rf"\[{rule}\]$"):
                     read()
     assert load_arrays(path)["x"][7] == 7
+
+
+def test_a_disk_that_fails_is_no_damaged_file(tmp_path, monkeypatch):
+    """zipfile answers a read that fails with "not a zip file"."""
+    save_arrays(tmp_path / "a.npz", {"x": np.arange(3)})
+
+    def failing(file):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(zipfile, "_EndRecData", failing)
+    with pytest.raises(EnvironmentFailure, match=r"Input/output error.+\[environment\.io\]$"):
+        load_arrays(tmp_path / "a.npz")

@@ -39,6 +39,21 @@ def test_a_damaged_binary_layer_is_made_again(capture, converted, copied, name, 
     assert not list(copied.glob("adopted-*"))
 
 
+def test_a_damaged_root_is_made_again_once_it_is_removed(capture, converted, copied, capsys):
+    """It is written once: what an artist may have put there is not replaced, and the sentence tells
+    what helps."""
+    root = copied / "room.usda"
+    cut(root, root.stat().st_size // 2)
+    for options in ((), ("--discard",)):
+        command = ["convert", str(capture), "-o", str(copied), *COARSE, *options]
+        assert main(command) == 3
+        said = capsys.readouterr().err
+        assert f"{root}: this is not a readable USD layer. Correct it, or remove it and run" in said
+    root.unlink()
+    convert(capture, copied)
+    assert bytes_of(copied) == bytes_of(converted.folder)
+
+
 def test_a_damaged_scan_is_made_again_with_other_options(capture, converted, copied):
     cut(copied / "layers/scan.usdc")
     convert(capture, copied, "--crease-angle", "60")

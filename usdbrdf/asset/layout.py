@@ -279,9 +279,11 @@ def path_in_asset(layer_relative: str) -> str:
 
 def open_metadata(layer: Path) -> Sdf.Layer:
     """A private copy of a layer's metadata, read from the file as it is now."""
+    # What lies beside the folder of layers is written once: no run replaces it while it is there.
+    cure = "Correct it, or remove it and run" if (layer.parent / "layers").is_dir() else "Run"
     refused = InputRefused(
-        f"{layer}: this is not a readable USD layer. Run `usdbrdf convert` again, which makes it "
-        "anew. [stage.unreadable]"
+        f"{layer}: this is not a readable USD layer. {cure} `usdbrdf convert` again, which makes "
+        "it anew. [stage.unreadable]"
     )
     try:
         opened = Sdf.Layer.OpenAsAnonymous(str(layer), metadataOnly=True)

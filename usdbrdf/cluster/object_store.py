@@ -8,13 +8,15 @@ that they open.
 
 from __future__ import annotations
 
+import configparser
 import errno
+import os
 import re
 import secrets
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path, PosixPath
@@ -305,7 +307,14 @@ def _noted(folder: Path) -> str | None:
 def refuse_unknown(address: str) -> None:
     """UsageError for a store that nothing knows, EnvironmentFailure where what does is not
     installed; nobody is asked for it yet."""
-    from fsspec import get_filesystem_class
+    try:
+        from fsspec import get_filesystem_class
+    except (ValueError, configparser.Error, OSError) as error:  # files of settings are read first
+        folder = os.environ.get("FSSPEC_CONFIG_DIR", "~/.config/fsspec")
+        raise UsageError(
+            f"--shared-folder {address}: a file of fsspec's settings in {folder} cannot be read "
+            f"({' '.join(str(error).split())}). Correct it or move it away. [cluster.settings]"
+        ) from error
 
     kind = address.partition("://")[0]
     try:
@@ -335,11 +344,14 @@ def _file_system(address: str) -> tuple[Any, str]:
         if kind in ("file", "local"):  # folders are made where there are such
             more["auto_mkdir"] = True
         if kind in ("s3", "s3a"):  # a user's own settings of fsspec count before ours
-            own = [conf.get(name, {}).get("config_kwargs", {}) for name in ("s3", "s3a")]
-            more["config_kwargs"] = _PATIENCE | own[0] | own[1]
+            more["config_kwargs"] = (
+                _PATIENCE | _own_settings(conf, "s3") | _own_settings(conf, "s3a")
+            )
         system, prefix = url_to_fs(address, use_listings_cache=False, **more)
         if kind in ("s3", "s3a"):
             system.retries = 1  # the client within tries again
+    except UsageError:
+        raise
     except Exception as error:  # of those that ask their store at once, of every library its own
         raise EnvironmentFailure(
             f"--shared-folder {address}: the object store does not answer "
@@ -347,3 +359,17 @@ def _file_system(address: str) -> tuple[Any, str]:
             "reaches it, then run the same command again; finished work is kept. [cluster.objects]"
         ) from error
     return system, str(prefix)
+
+
+def _own_settings(conf: Mapping[str, Any], kind: str) -> dict[str, Any]:
+    """What a user has set of how the client waits, in the environment or a file of fsspec's; of
+    what is no JSON fsspec makes a string."""
+    settings = conf.get(kind, {})
+    own = settings.get("config_kwargs", {}) if isinstance(settings, dict) else settings
+    if not isinstance(own, dict):
+        raise UsageError(
+            f"config_kwargs of {kind}:// in your settings of fsspec: {own!r} is no table of names "
+            f"and values. Correct FSSPEC_{kind.upper()}_CONFIG_KWARGS, which holds one as JSON, or "
+            "the file in ~/.config/fsspec. [cluster.settings]"
+        )
+    return own

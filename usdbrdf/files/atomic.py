@@ -292,13 +292,18 @@ def failure_of_machine(error: Exception) -> EnvironmentFailure | None:
     return _failure(str(_place_of(error) or "this machine"), error)
 
 
-def raise_shortage(error: BaseException) -> None:
+def raise_shortage(error: BaseException | None) -> None:
     """Raise ``failure_of_machine`` where no file that was being read can be to blame, whatever
-    reader stumbled: threads, open files, memory, a disk that fails. Permission is the file's."""
-    if not isinstance(error, Exception) or isinstance(error, PermissionError):
-        return
-    if (failure := failure_of_machine(error)) is not None:
-        raise failure from error
+    reader stumbled: threads, open files, memory, a disk that fails. Permission is the file's.
+
+    Libraries answer an error with one of their own, zipfile a failing read with "not a zip file",
+    so that those before it are looked at too."""
+    while error is not None:
+        if isinstance(error, Exception) and not isinstance(error, PermissionError):
+            failure = failure_of_machine(error)
+            if failure is not None:
+                raise failure from error
+        error = error.__cause__ or error.__context__
 
 
 def _place_of(error: OSError) -> object:

@@ -28,6 +28,7 @@ from usdbrdf.files.atomic import (
 )
 from usdbrdf.files.camera_colour import space_by_exif
 from usdbrdf.files.channels import colours_of, layers_with_colours
+from usdbrdf.files.exr_bytes import lists_its_chunks
 from usdbrdf.files.icc_profiles import space_of_profile
 from usdbrdf.files.jpeg_bytes import END, JPEG_SUFFIXES, jpeg_without_metadata, segments_of_jpeg
 from usdbrdf.files.paths import readable_size
@@ -454,8 +455,8 @@ def write_image(path: Path, staged: Path, spec: Any, pixels: Any) -> None:
 
 
 def refuse_other(path: Path, staged: Path, pixels: Float | Byte, *, holes: bool = False) -> None:
-    """EnvironmentFailure unless these are the pixels of the file that was written: closing it says
-    nothing of a full disk.
+    """EnvironmentFailure unless these are the pixels of the file that was written, and all of it
+    was: closing it says nothing of a full disk.
 
     holes  NaN is compared too; else it stands for any value
     """
@@ -465,7 +466,7 @@ def refuse_other(path: Path, staged: Path, pixels: Float | Byte, *, holes: bool 
             stored = np.rint(stored * 255)
         if stored.shape == pixels.shape:
             unasked = np.isnan(pixels) & np.isnan(stored) if holes else ~np.isfinite(pixels)
-            if ((stored == pixels) | unasked).all():
+            if ((stored == pixels) | unasked).all() and lists_its_chunks(staged):
                 return
         cause = None
     except ImageRefused as error:
