@@ -138,7 +138,8 @@ def test_a_mirror_is_looked_for_though_a_dielectric_explains_next_to_nothing_of_
     psi: float, evidence: float, asked: bool, monkeypatch
 ):
     """1 - (1 - 0.08 / 0.95)^2 = 0.16 of what a silver mirror shows."""
-    first = LobeEstimate(0.0, psi, 0.01, 0.1, 0.0, 1.0, evidence)
+    # Whatever noise of rays does to psi.
+    first = LobeEstimate(0.0, psi, 0.01, 0.1, 0.0, 1.0, evidence, (0.5, 0.5))
     seen = []
     monkeypatch.setattr(fit_views, "repeated_where_noisy", lambda first, *_: first)
     monkeypatch.setattr(fit_views, "conductor_of", lambda *_, **__: seen.append(1))
@@ -147,6 +148,16 @@ def test_a_mirror_is_looked_for_though_a_dielectric_explains_next_to_nothing_of_
     sampled = SimpleNamespace(samples=samples, irradiance=zeros, basis=lambda *_: _basis(2))
     fit_views.fit_views(DIELECTRIC, lambda: sampled, 0, first)
     assert bool(seen) == asked
+
+
+def test_of_a_metal_in_light_that_nobody_knows_f0_is_unknown_and_no_more_than_that(monkeypatch):
+    metal = _found((0.01 + F0) * _incident(1), 1.0)
+    assert metal is not None
+    monkeypatch.setattr(fit_views, "error_by_doubt", lambda *_: 60.0)
+    mirror = LobeEstimate(0.0, 1.0, 0.01, 0.1, 0.0, 1.0, 0.1)
+    found, doubted = fit_views.with_doubts_of_light(DIELECTRIC, lambda: None, 0, mirror, metal)
+    assert doubted.f0_error == found.psi_error == pytest.approx(1 / math.sqrt(12))
+    assert fit_views.with_doubts_of_light(DIELECTRIC, lambda: None, 0, mirror, None)[0] is mirror
 
 
 @pytest.mark.parametrize("texture", [0.0, 0.4])

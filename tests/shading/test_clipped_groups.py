@@ -86,7 +86,7 @@ def test_a_clipped_lamp_is_one_group_with_what_nobody_saw_of_it(world: World, ow
     np.testing.assert_array_equal(np.flatnonzero(found.group == 0), lamp)
 
 
-def test_a_lamp_of_which_frames_show_next_to_nothing_is_one(world: World, own):
+def test_a_lamp_of_which_few_texels_clip_is_one_where_no_other_is_seen(world: World, own):
     lit = world.per_object([(0.2, 0.2, 0.2)] * 6 + [(0.1 * BOUND,) * 3])
     lamp = own(LAMP)
     found = _groups(world, lit, lamp[:15], unseen=lamp[15:])
@@ -94,10 +94,17 @@ def test_a_lamp_of_which_frames_show_next_to_nothing_is_one(world: World, own):
     np.testing.assert_array_equal(np.flatnonzero(found.group == 0), lamp)
 
 
-def test_a_glint_is_not_all_that_an_object_is(world: World, own):
+@pytest.mark.parametrize(("clipped", "measured"), [(3, 0), (15, 1)])
+def test_a_glint_is_not_all_that_an_object_is_but_where_a_person_says_so(
+    world: World, own, clipped: int, measured: int
+):
     lit = world.per_object([(0.2, 0.2, 0.2)] * 6 + [(0.1 * BOUND,) * 3])
     lamp = own(LAMP)
-    assert len(_groups(world, lit, lamp[:3], unseen=lamp[3:])) == 0
+    coverage = _coverage(lit, lamp[:clipped], unseen=lamp[clipped + measured :])
+    assert len(clipped_groups(world.texels, lit, coverage)) == 0
+    assert len(clipped_groups(world.texels, lit, coverage, {LAMP: False})) == 0
+    found = clipped_groups(world.texels, lit, coverage, {LAMP: True})
+    assert found.lamp.tolist() == found.small.tolist() == [True]
 
 
 def test_few_clipped_texels_of_what_else_is_measured_are_a_glint(world: World, own):

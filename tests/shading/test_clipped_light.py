@@ -20,6 +20,7 @@ from usdbrdf.shading import clipped_light, lamp_light
 from usdbrdf.shading.clipped_emitters import EstimatedRadiance
 from usdbrdf.shading.clipped_groups import ClippedGroups
 from usdbrdf.shading.clipped_light import ClippedLight, _with_estimates, estimate_clipped_light
+from usdbrdf.shading.shaded import shade_surface
 from usdbrdf.transport.environment import Environment, Sun, black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -94,6 +95,66 @@ def _estimated(
     return estimate_clipped_light(run, surface, lit, coverage, frames, environment, 0, said)
 
 
+@pytest.fixture(scope="module")
+def beside_walls() -> tuple[World, np.ndarray, np.ndarray]:
+    """A white room with a lamp in its corner, object 6, and L_d of photographs in which all that is
+    brighter than most walls clips."""
+    lamp = quad((0.15, 1.2, 2.3), (0, 0.6, 0), (0.25, 0, 0))
+    corner = world_of([*room((0, 0, 0), (4, 3, 2.5), size=(48, 48)), lamp])
+    albedo = corner.per_object([(0.8, 0.8, 0.8)] * 6 + [(0, 0, 0)])
+    albedo *= np.exp(0.03 * np.random.default_rng(5).standard_normal((len(albedo), 1)))
+    emitted = corner.per_object([(0, 0, 0)] * 6 + [(30, 25, 20)])
+    light = _shone(corner, albedo.astype(np.float32), emitted, bounces=6)
+    clipped = (light >= 0.5).any(axis=1)
+    return corner, np.where(clipped[:, None], np.float32(0.5), light), clipped
+
+
+def test_lamps_do_not_make_up_for_what_walls_that_clip_reflect_of_them(beside_walls, tmp_path):
+    """0.5 instead of 1.5 to 2.7: 43, 36, 28 if they do."""
+    corner, lit, clipped = beside_walls
+    light = _estimated(corner, lit, clipped, tmp_path)
+    assert light.groups.object[light.groups.lamp].tolist() == [6]
+    found = light.lit[corner.texels.of_object(6)].mean(axis=0)
+    np.testing.assert_allclose(found, (30, 25, 20), rtol=0.25)
+
+
+def test_of_walls_of_unknown_albedo_nothing_is_reckoned(beside_walls, tmp_path, monkeypatch):
+    corner, lit, clipped = beside_walls
+    reckoned = []
+
+    def hidden(surface, lit, *_):
+        reckoned.append(1)
+        return lit
+
+    monkeypatch.setattr(clipped_light, "light_of_hidden", hidden)
+    owner = corner.texels.object_index()
+    walls = np.isin(owner, np.unique(owner[clipped]))
+    _estimated(corner, np.where(walls[:, None], np.float32(0.5), lit), walls, tmp_path)
+    assert not reckoned
+    _estimated(corner, lit, clipped, tmp_path / "some")
+    assert reckoned
+
+
+def test_a_glint_takes_no_lamp_for_a_wall(tmp_path: Path):
+    """A lamp that is measured, and a knob of which two texels clip."""
+    lamp = quad((1, 1, 2.3), (0, 0.4, 0), (0.4, 0, 0))
+    knob = quad((3.97, 1.5, 1.0), (0, 0, 0.03), (0, 0.03, 0), size=(3, 3))
+    place = world_of([*room((0, 0, 0), (4, 3, 2.5), size=(20, 20)), lamp, knob])
+    albedo = place.per_object([*ALBEDO, (0, 0, 0), (0.3, 0.3, 0.3)])
+    emitted = place.per_object([(0, 0, 0)] * 6 + [(2.5, 2.5, 2.5), (0, 0, 0)])
+    lit = _shone(place, albedo, emitted, bounces=4)
+    own = np.flatnonzero(place.texels.object_index() == 7)
+    lit[own], clipped, seen = SATURATION, np.zeros(len(lit), bool), np.ones(len(lit), bool)
+    clipped[own[4:6]], seen[own] = True, False
+    frames = frames_at([look_at(np.array([0.4, 0.4, 1.5]), np.array([2.0, 1.5, 1.0]))])
+    surface = TexturedScene(place.scene, place.texels, place.rays)
+    coverage, run = CoverageMap.of(seen, clipped), TaskRun(tmp_path, "shade", tmp_path / "work")
+    sampling = Sampling(standard_error=0.03, max_rays=256)
+    shaded = shade_surface(run, surface, lit, coverage, frames, None, sampling, "none")
+    assert shaded.light.groups.object.tolist() == [7]
+    assert shaded.emitters.is_lamp[6]
+
+
 def test_a_night_sky_takes_no_lamp_for_what_reflects_it(
     world: World, truth: np.ndarray, tmp_path: Path, monkeypatch
 ):
@@ -148,6 +209,7 @@ def test_an_undetermined_lamp_stands_below_its_estimate_or_at_what_was_measured(
         object=np.arange(3, dtype=np.int32),
         bound=np.full((3, 3), 4.0, np.float32),
         lamp=np.array([True, True, False]),
+        small=np.zeros(3, np.bool_),
         wall=group == 2,
     )
     estimate = EstimatedRadiance(
@@ -160,6 +222,8 @@ def test_an_undetermined_lamp_stands_below_its_estimate_or_at_what_was_measured(
     light = ClippedLight(lit=np.zeros((8, 3), np.float32), groups=one, estimate=estimate)
     for reflected, dimmest in ((0, 4), (4, 6), (7, 0)):
         assert light.least_of_lamps(np.full(8, float(reflected))) == dimmest
+    glint = replace(light, groups=replace(one, small=np.array([True, False, False])))
+    assert glint.least_of_lamps(np.zeros(8)) == 6
     lit = np.tile(np.float32([[4.0] * 3, [4.5] * 3]), (4, 1))
     found = _with_estimates(lit, groups, estimate)
     expected = lit.copy()
@@ -173,6 +237,7 @@ def test_what_nobody_saw_of_a_lamp_shines_only_if_the_lamp_is_determined():
         object=np.arange(2, dtype=np.int32),
         bound=np.full(2, 4.0, np.float32),
         lamp=np.ones(2, np.bool_),
+        small=np.zeros(2, np.bool_),
         wall=np.zeros(5, np.bool_),
     )
     estimate = EstimatedRadiance(

@@ -12,7 +12,7 @@ from tests.physics.surfaces import Sampling, box, quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap, Texels
-from usdbrdf.shading import shaded
+from usdbrdf.shading import clipped_light, shaded
 from usdbrdf.shading.clipped_groups import clipped_groups
 from usdbrdf.shading.clipped_light import estimate_clipped_light
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden
@@ -230,7 +230,7 @@ def test_a_lamp_that_clips_is_unknown_meanwhile(hall):
     np.testing.assert_allclose(found.radiance[0], RADIANCE, rtol=0.25)
 
 
-def test_what_clips_in_the_light_of_a_lamp_that_no_frame_shows_is_none(hall, tmp_path):
+def test_what_clips_in_the_light_of_a_lamp_that_no_frame_shows_is_none(hall, tmp_path, monkeypatch):
     surface, lit, coverage = _photographed(hall, RADIANCE, LAMP)
     lit[surface.texels.of_object(LAMP)] = RADIANCE
     block = surface.texels.object_index() == BLOCK
@@ -239,13 +239,25 @@ def test_what_clips_in_the_light_of_a_lamp_that_no_frame_shows_is_none(hall, tmp
     shown = np.where(clipped[:, None], np.minimum(lit, limit), lit)
     seen = CoverageMap.of(coverage.observed & ~clipped, clipped)
 
-    def is_lamp(name: str, **given: bool) -> list[bool]:
+    def is_lamp(name: str, **given: np.ndarray) -> list[bool]:
         run = TaskRun(tmp_path, "shade", tmp_path / name)
         light = estimate_clipped_light(run, surface, shown, seen, FRAMES, DARK, 0, **given)
         return light.groups.lamp.tolist()
 
+    unseen = surface.texels.object_index() == LAMP
     assert is_lamp("nothing else") == [True]
-    assert is_lamp("lit", lit_unseen=True) == [False]
+    assert is_lamp("lit", unseen=unseen) == [False]
+
+    # That light is on while it is reckoned what the block sends on.
+    known = []
+
+    def hidden(surface, lit, coverage, environment, seed, lamps):
+        known.append(lamps.texel[unseen].all())
+        return lit
+
+    monkeypatch.setattr(clipped_light, "light_of_hidden", hidden)
+    is_lamp("again", unseen=unseen)
+    assert known == [True]
 
 
 def test_what_a_person_says_of_an_object_holds(hall):

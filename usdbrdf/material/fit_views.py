@@ -297,7 +297,7 @@ def fit_views(
 
     found = repeated_where_noisy(first or fitted(first_seed(seed), 1), fitted, seed)
     # The brightest dielectric explains that much of what a mirror of all light shows.
-    explained = 1 - (1 - F0_OF_PSI) ** 2 if found.psi + found.of_rays[1] >= 1 else 1.0
+    explained = 1 - (1 - F0_OF_PSI) ** 2 if found.is_brightest else 1.0
     shows = found.evidence > explained * SOME_EVIDENCE
     bright = shows and found.psi + 2 * found.psi_error > 1
     if not (bright or metal) or (irradiance := sampled().irradiance) is None:
@@ -322,7 +322,8 @@ def with_doubts_of_light(
 ) -> tuple[LobeEstimate, Conductor | None]:
     """The same with the errors that follow from those of light that was inferred, not seen: what a
     lobe mirrors of a lamp is psi times the lamp's radiance, and only that is measured. All doubts
-    are taken to be off the same way. Where psi is badly known anyway nothing is traced."""
+    are taken to be off the same way. Where psi of a dielectric is badly known anyway nothing is
+    traced."""
     untold = found.evidence < SOME_EVIDENCE or found.psi_error > MAX_PSI_ERROR
     if untold and metal is None:
         return found, metal
@@ -331,7 +332,8 @@ def with_doubts_of_light(
         kind, phi, psi = CONDUCTOR, metal.phi, max(metal.f0) / F0_OF_PSI
     off = error_by_doubt(sampled(), kind, phi, psi, seed)
     if metal is not None:
-        metal = metal._replace(f0_error=math.hypot(metal.f0_error, F0_OF_PSI * off))
+        error = min(math.hypot(metal.f0_error, F0_OF_PSI * off), float(NOTHING_KNOWN))
+        metal = metal._replace(f0_error=error)
         off *= found.psi / psi if psi > 0 else 1.0
     psi_error = min(math.hypot(found.psi_error, off), float(NOTHING_KNOWN))
     above = math.hypot(found.psi_upper - found.psi, _UPPER * off)

@@ -35,6 +35,7 @@ class ClippedGroups:
     object (K,) int32, whose texels they are
     bound  (K,) float32, the largest radiance at which one of its texels clipped
     lamp   (K,) bool: no measured texel around is nearly as bright, nor does daylight explain it
+    small  (K,) bool: of so few texels that it may be a glint as well
     wall   (T,) bool: the texels of those that are no lamps, of fainter ones than the K too
     """
 
@@ -42,6 +43,7 @@ class ClippedGroups:
     object: Int
     bound: Float
     lamp: Bool
+    small: Bool
     wall: Bool
 
     def __len__(self) -> int:
@@ -81,22 +83,23 @@ def clipped_groups(
     said: Mapping[int, bool] = MappingProxyType({}),
 ) -> ClippedGroups:
     """An object more than half of whose observed area clipped is one group, with what nobody saw
-    of it; on others each connected part is one.
+    of it; on others each connected part is one. Few texels are none, unless they are all that was
+    seen of an object, and enough of it, or a person says that it is a lamp.
 
     radiance (T, 3): L_d, a lower bound where ``coverage`` says clipped
     said     of objects whether they are lamps, where that is known
     """
-    found: list[tuple[float, int, float, bool, Long]] = []
+    found: list[tuple[float, int, float, bool, bool, Long]] = []
     measured, clipped = coverage.measured, coverage.clipped
     bright = radiance.max(axis=1)
     reach = _AROUND * float(np.sqrt(texels.area.sum()))
     for i in range(len(texels.resolution)):
         own = np.arange(*texels.of_object(i).indices(len(texels)))
         candidates, around = own[clipped[own]], own[measured[own]]
-        shines, area = texels.area[candidates].sum(), texels.area[own].sum()
-        whole = shines > texels.area[around].sum()
-        # A lamp may be as small as it likes; few texels of what nobody saw as a whole are a glint.
-        if len(candidates) < _MIN_TEXELS and not (whole and shines > _SHOWN_OF_SMALL * area):
+        shines = texels.area[candidates].sum()
+        whole, small = shines > texels.area[around].sum(), len(candidates) < _MIN_TEXELS
+        shown = not len(around) and shines > _SHOWN_OF_SMALL * texels.area[own].sum()
+        if small and not (whole and said.get(i, shown)):
             continue
         parts = [own[~measured[own]]] if whole else _connected(texels, candidates)
         for part in parts:
@@ -108,9 +111,9 @@ def clipped_groups(
             lamp = said.get(i, lamp)
             # What it may send at most, by all likelihood.
             most = bound * float(np.exp(sum(LAMP_PRIOR if lamp else _WALL_PRIOR)))
-            found.append((most * float(texels.area[part].sum()), i, bound, lamp, part))
+            found.append((most * float(texels.area[part].sum()), i, bound, lamp, small, part))
     wall = np.zeros(len(texels), np.bool_)
-    for *_, lamp, part in found:
+    for *_, lamp, _, part in found:
         wall[part] = not lamp
     found = sorted(found, key=lambda item: -item[0])[:_MAX_GROUPS]
     group = np.full(len(texels), -1, np.int32)
@@ -121,6 +124,7 @@ def clipped_groups(
         object=np.array([item[1] for item in found], np.int32),
         bound=np.array([item[2] for item in found], np.float32),
         lamp=np.array([item[3] for item in found], np.bool_),
+        small=np.array([item[4] for item in found], np.bool_),
         wall=wall,
     )
 

@@ -106,12 +106,13 @@ class ClippedLight:
     def least_of_lamps(self, reflected: Float) -> float:
         """Radiance, in its largest channel, of the dimmest lamp that stayed a lower bound; 0 if
         none did. ``reflected`` (T,): the most that a reflector would show in any channel: what is
-        bounded by no more than that may be one, as a sunlit patch is."""
+        bounded by no more than that may be one, as a sunlit patch is, and so may what is small."""
         group, count = self.groups.group, len(self.groups)
         own = group >= 0
         num_own = np.maximum(np.bincount(group[own], minlength=count), 1)
         level = np.bincount(group[own], reflected[own], count) / num_own
-        lamp = self.groups.lamp & ~self.estimate.determined & (self.groups.bound > level)
+        lamp = self.groups.lamp & ~self.groups.small & ~self.estimate.determined
+        lamp &= self.groups.bound > level
         return float(self.groups.bound[lamp].min()) if lamp.any() else 0.0
 
 
@@ -124,20 +125,19 @@ def estimate_clipped_light(
     environment: Environment,
     seed: int,
     said: Mapping[int, bool] = MappingProxyType({}),
-    *,
-    lit_unseen: bool = False,
+    unseen: Bool | None = None,
 ) -> ClippedLight:
     """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
-    said: of objects whether they are lamps, where that is known. lit_unseen: by lamps that no frame
-    shows, whose radiance is in ``lit``."""
+    said: of objects whether they are lamps, where that is known. unseen (T,): the texels of lamps
+    that no frame shows, whose radiance is in ``lit``; None without any."""
     groups = clipped_groups(surface.texels, lit, coverage, said)
     if not groups.lamp.any():
         return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
-        weighing = _Weighing.of(surface, lit, coverage, frames, environment, groups, said, seed)
-        told, wall = weighing.told(lit_unseen)
+        given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
+        told, wall = _Weighing.of(*given).told()
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
@@ -167,9 +167,11 @@ class _Weighing(NamedTuple):
     environment: Environment
     groups: ClippedGroups
     said: Mapping[int, bool]
+    unseen: Bool | None
     seed: int
     chosen: Long
     segment: Int
+    lamp_irradiance: Float
     asked: Asked | None
 
     @classmethod
@@ -182,43 +184,57 @@ class _Weighing(NamedTuple):
         environment: Environment,
         groups: ClippedGroups,
         said: Mapping[int, bool],
+        unseen: Bool | None,
         seed: int,
     ) -> _Weighing:
-        chosen = _chosen(surface.texels, groups, coverage.measured, seed)
+        chosen, segment = _chosen(surface.texels, groups, coverage.measured, seed)
+        each = _of_each(surface, groups, chosen, seed)
         # With their bounds, whatever light of the sun what clips is taken to reflect.
         asked = asked_texels(surface.texels, lit, coverage, seed)
-        return cls(surface, lit, coverage, frames, environment, groups, said, seed, *chosen, asked)
+        given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
+        return cls(*given, chosen, segment, each, asked)
 
-    def told(self, lit_unseen: bool) -> tuple[EstimatedRadiance, Bool]:
+    def told(self) -> tuple[EstimatedRadiance, Bool]:
         """The estimate, and which of the groups (K,) reflect the light of others than these."""
         groups, wall = self.groups, np.zeros(len(self.groups), np.bool_)
         if not len(self.chosen):
             return nothing_known(len(groups)), wall
         told, evenly = self._by(self.lit, groups)
-        if lit_unseen or self.environment.sun.shines or self._is_day():
+        if self.unseen is not None or self.environment.sun.shines or self._is_day():
             wall = self._reflect_other_light(told, evenly)
         if wall.any():
             # What the sun shines on may be many times its bound, which lamps beside it would send.
             told = self._beside(self.lit, wall)
-        walls = wall | ~groups.lamp
-        if told.determined[~walls].any() and self._matter(walls):
+        walls = wall | (~groups.lamp & self._is_measured())
+        if walls.any() and told.determined[~walls].any() and self._matter(walls):
             # So may what the lamps themselves shine on.
             told = self._beside(_with_estimates(self.lit, groups, told.of_lamps(~walls)), walls)
         return told, wall
 
+    def _is_measured(self) -> Bool:
+        """Of which of the groups' objects (K,) frames tell the albedo."""
+        owner = self.surface.texels.object_index()
+        return np.isin(self.groups.object, owner[self.coverage.measured])
+
     def _by(self, light: Float, groups: ClippedGroups) -> tuple[EstimatedRadiance, Bool]:
         """As of ``_told_by_even_light``."""
         surface, outside, seed = self.surface, self.environment, self.seed
-        evidence = _evidence(surface, light, groups, self.chosen, self.segment, outside, seed)
+        # What a group of no texels brings counts as nothing.
+        left = np.isin(np.arange(len(groups)), groups.group)
+        each = np.where(left[:, None, None], self.lamp_irradiance, np.float32(0))
+        chosen = self.chosen, self.segment, each
+        evidence = _evidence(surface, light, groups, chosen, outside, seed)
         first = estimate_clipped_emitters(evidence)
         given = surface, light, self.asked, self.frames, outside, groups, first, seed
         return _told_by_even_light(*given)
 
     def _beside(self, light: Float, walls: Bool) -> EstimatedRadiance:
-        """In ``light`` (T, 3) with what those of the groups (K,) reflect of it."""
-        left = self.groups.with_walls(walls)
-        given = self.coverage, left, walls, self.environment, self.seed, self.said
-        light = _reflecting(self.surface, light, *given)
+        """Where those of the groups (K,) send what they reflect of the ``light`` (T, 3)."""
+        left, shines = self.groups.with_walls(walls), said_to_shine(self.surface.texels, self.said)
+        shines |= left.texels_of(left.lamp) | (False if self.unseen is None else self.unseen)
+        given = self.coverage, self.environment, self.seed, KnownLamps(shines, self.said)
+        light = light_of_hidden(self.surface, light, *given)
+        light = np.where(left.texels_of(walls)[:, None], light, self.lit)
         return self._by(light, left.without(walls))[0].of_lamps(~walls)
 
     def _reflect_other_light(self, told: EstimatedRadiance, evenly: Bool) -> Bool:
@@ -294,23 +310,6 @@ def reflects_other_light(
         ratio = most.max(axis=1) / lit[one].max(axis=1)
         explained[k] = np.quantile(ratio, 1 - _SOME_EXPLAINED) > share * least[k]
     return explained
-
-
-def _reflecting(
-    surface: TexturedScene,
-    lit: Float,
-    coverage: CoverageMap,
-    groups: ClippedGroups,
-    wall: Bool,
-    environment: Environment,
-    seed: int,
-    said: Mapping[int, bool],
-) -> Float:
-    """``lit`` (T, 3) with what those of the groups (K,) that are walls reflect."""
-    told = said_to_shine(surface.texels, said)
-    lamps = KnownLamps(told | groups.texels_of(groups.lamp), said)
-    light = light_of_hidden(surface, lit, coverage, environment, seed, lamps)
-    return np.where(groups.texels_of(wall)[:, None], light, lit)
 
 
 def _with_estimates(lit: Float, groups: ClippedGroups, estimate: EstimatedRadiance) -> Float:
@@ -390,23 +389,28 @@ def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) ->
     return usable[kept], segment[kept]
 
 
+def _of_each(surface: TexturedScene, groups: ClippedGroups, chosen: Long, seed: int) -> Float:
+    """(K, N, 3) W/m^2: what each of the groups brings to the texels ``chosen``, at its bound."""
+    lamps = np.zeros((len(groups), len(chosen), 3), np.float32)
+    for k in np.unique(groups.group[groups.group >= 0]) if len(chosen) else ():
+        alone = np.where((groups.group == k)[:, None], groups.bound[k], np.float32(0))
+        light = Shining.of(surface, np.repeat(alone, 3, axis=1).astype(np.float32))
+        lamps[k] = irradiance_of_texels(
+            surface, light, black_environment(), chosen, seed + int(k) + 1
+        )
+    return lamps
+
+
 def _evidence(
     surface: TexturedScene,
     lit: Float,
     groups: ClippedGroups,
-    chosen: Long,
-    segment: Int,
+    told_by: tuple[Long, Int, Float],
     environment: Environment,
     seed: int,
 ) -> Evidence:
-    texels = surface.texels
-
-    lamps = np.zeros((len(groups), len(chosen), 3), np.float32)
-    for k in np.unique(groups.group[groups.group >= 0]):
-        alone = np.where((groups.group == k)[:, None], groups.bound[k], np.float32(0))
-        light = Shining.of(surface, np.repeat(alone, 3, axis=1).astype(np.float32))
-        dark, own_seed = black_environment(), seed + int(k) + 1
-        lamps[k] = irradiance_of_texels(surface, light, dark, chosen, own_seed)
+    """told_by: texels, their segments, and what each of the groups brings them."""
+    texels, (chosen, segment, lamps) = surface.texels, told_by
     rest = np.where(groups.group[:, None] >= 0, np.float32(0), lit)
     return Evidence(
         radiance=lit[chosen],

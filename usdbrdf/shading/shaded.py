@@ -360,11 +360,12 @@ def _light(
     known = KnownLamps(may_shine, said, doubt=doubt)
     measured = lit, coverage, environment, seed, known
     lit, unseen = _lit_by_unseen_lamps(run, surface, *measured, frames, shine)
+    of_unseen = np.isin(owner, unseen.object)
     light = estimate_clipped_light(
         run, surface, lit, coverage, frames, environment, seed, said,
-        lit_unseen=bool(len(unseen.object)),
+        of_unseen if of_unseen.any() else None,
     )  # fmt: skip
-    lamps = light.groups.texels_of(light.groups.lamp) | np.isin(owner, unseen.object)
+    lamps = light.groups.texels_of(light.groups.lamp) | of_unseen
     if (light.lit[lamps] == filled[lamps]).all() and not (may_shine & ~told & ~lamps).any():
         return light, unseen
     # Hidden surfaces send on the light of these as well; what clips and is no lamp reflects it.
