@@ -125,21 +125,22 @@ def test_the_roughest_metal_is_told_by_nobody_but_a_person():
 
 
 @pytest.mark.parametrize(
-    ("psi", "evidence", "asked"),
+    ("psi", "noise", "evidence", "asked"),
     [
-        (1.0, 0.16, True),
-        (1.0, 0.02, False),
-        (0.9, 0.16, False),
-        (0.9, 0.5, True),
-        (0.3, 0.5, False),
+        (1.0, 0.0, 0.16, True),
+        (1.0, 0.0, 0.02, False),
+        (0.9, 0.0, 0.16, False),
+        (0.95, 0.1, 0.16, True),
+        (0.6, 0.4, 0.16, False),
+        (0.9, 0.0, 0.5, True),
+        (0.3, 0.4, 0.5, False),
     ],
 )
 def test_a_mirror_is_looked_for_though_a_dielectric_explains_next_to_nothing_of_it(
-    psi: float, evidence: float, asked: bool, monkeypatch
+    psi: float, noise: float, evidence: float, asked: bool, monkeypatch
 ):
     """1 - (1 - 0.08 / 0.95)^2 = 0.16 of what a silver mirror shows."""
-    # Whatever noise of rays does to psi.
-    first = LobeEstimate(0.0, psi, 0.01, 0.1, 0.0, 1.0, evidence, (0.5, 0.5))
+    first = LobeEstimate(0.0, psi, 0.01, 0.1, 0.0, 1.0, evidence, (0.0, noise))
     seen = []
     monkeypatch.setattr(fit_views, "repeated_where_noisy", lambda first, *_: first)
     monkeypatch.setattr(fit_views, "conductor_of", lambda *_, **__: seen.append(1))

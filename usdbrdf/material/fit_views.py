@@ -296,8 +296,9 @@ def fit_views(
         return fit_kinds(sampled(), [lobe], own_seed, repeats)[lobe].lobe
 
     found = repeated_where_noisy(first or fitted(first_seed(seed), 1), fitted, seed)
-    # The brightest dielectric explains that much of what a mirror of all light shows.
-    explained = 1 - (1 - F0_OF_PSI) ** 2 if found.is_brightest else 1.0
+    # The brightest dielectric, as far as rays tell, explains so much of what a mirror shows.
+    is_brightest = found.psi + min(found.of_rays[1], MAX_PSI_ERROR) >= 1
+    explained = 1 - (1 - F0_OF_PSI) ** 2 if is_brightest else 1.0
     shows = found.evidence > explained * SOME_EVIDENCE
     bright = shows and found.psi + 2 * found.psi_error > 1
     if not (bright or metal) or (irradiance := sampled().irradiance) is None:

@@ -48,11 +48,6 @@ class LobeEstimate(NamedTuple):
     psi_upper: float = 1.0
     contradiction: float = 0.0
 
-    @property
-    def is_brightest(self) -> bool:
-        """Whether psi is at the end of its range: it is only known to be no less."""
-        return bool(self.psi >= _PSI_GRID[-2])
-
 
 def lobe_from_costs(
     phis: Double,
@@ -252,7 +247,8 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
         return "low" if lobe.evidence >= SOME_EVIDENCE else "none"
 
     sure = confidence(phi_error, MAX_PHI_ERROR), confidence(psi_error, MAX_PSI_ERROR)
-    if lobe.is_brightest and sure[1] == "high":
+    if lobe.psi >= _PSI_GRID[-2] and sure[1] == "high":
+        # At the end of its range it is only known to be no less.
         sure = sure[0], "low"
     phi = lobe.phi if sure[0] == "high" else lobe.phi_median
     psi = lobe.psi if sure[1] == "high" else lobe.psi_median
