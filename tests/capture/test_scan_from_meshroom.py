@@ -242,6 +242,20 @@ def test_cameras_of_a_rig_stand_where_its_pose_and_their_own_in_it_say(tmp_path,
     assert_same(scan, room, points=room.points * OPENGL, poses=poses)
 
 
+def test_brackets_in_a_rig_that_was_never_solved_stand_where_their_pose_says(tmp_path):
+    """They share it, and do not state that it is not the rig's, as which no flag counts."""
+    room, document = truth(), _document(truth())
+    for i, view in enumerate(document["views"]):
+        view |= {"rigId": "5", "subPoseId": str(i % 2)}
+    document["views"][1]["poseId"] = document["views"][0]["poseId"]
+    document["rigs"] = [{"rigId": "5", "subPoses": [{"status": "uninitialized"}] * 2}]
+    shots = shots_of(document, (1, 2, 11), tmp_path)
+    poses = np.diag([*OPENGL, 1.0]) @ room.opencv
+    for shot, pose in zip(shots, poses[[0, 0, *range(2, 10)]], strict=True):
+        assert shot.problem == ""
+        np.testing.assert_allclose(shot.world_from_camera, pose, atol=1e-12)
+
+
 def test_views_that_no_rig_places_and_without_a_pose_are_left_out(tmp_path):
     room, document = truth(), _document(truth())
     document["views"][2] |= {"rigId": "5", "subPoseId": "0", "isPoseIndependant": "false"}

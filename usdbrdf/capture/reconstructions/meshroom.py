@@ -10,7 +10,6 @@ pose is the rig's, and each camera has its own within it.
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -171,17 +170,18 @@ def shots_of(document: object, version: Version, source: Path) -> list[Shot]:
         for number, place in enumerate(rows_of(row, "subPoses"))
     }
     views = rows_of(document, "views")
-    shared = Counter(str(view.get("poseId")) for view in views)
     found = []
     for view in views:
         pose, problem = poses.get(str(view.get("poseId"))), ""
-        # Of a rig one pose is that of all its cameras, unless each has its own.
-        together = "true" if shared[str(view.get("poseId"))] == 1 else "false"
-        apart = str(view.get("isPoseIndependant", together)).lower() in ("true", "1")
-        if "rigId" in view and not apart and pose is not None:
+        # Of a rig one pose is that of all its cameras, unless each has its own. Where that is not
+        # stated (brackets share a pose, too), it has a place in the rig if one was found.
+        stated = view.get("isPoseIndependant")
+        if "rigId" in view and str(stated).lower() not in ("true", "1") and pose is not None:
             place = rig_from_camera.get((str(view["rigId"]), str(view.get("subPoseId"))))
-            problem = "nothing says where it stands in its rig" if place is None else ""
-            pose = pose if place is None else pose @ place
+            if place is not None:
+                pose = pose @ place
+            elif stated is not None:
+                problem = "nothing says where it stands in its rig"
         found.append(
             Shot(
                 name=str(view.get("path") or view.get("viewId")),
