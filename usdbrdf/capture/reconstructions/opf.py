@@ -209,9 +209,9 @@ def _camera(stated: object, size: Double | None, source: Path) -> tuple[ShotCame
         lens, focals, turn = fisheye_of_turn(affine, rest)
         return ShotCamera(resolution=resolution, intrinsics=(*focals, cx, cy), lens=lens), turn
     if kind != "perspective":
-        said = "no stated type" if kind is None else f"the type {str(kind)[:40]!r}"
+        which = "no stated type" if kind is None else f"the type {str(kind)[:40]!r}"
         raise InputRefused(
-            f"{source}: a sensor of {said} is not read (known: perspective, fisheye, spherical). "
+            f"{source}: a sensor of {which} is not read (known: perspective, fisheye, spherical). "
             "Calibrate it as perspective or fisheye; or undistort the photographs elsewhere, and "
             "bring them with a transforms.json. [capture.camera]"
         )
