@@ -43,7 +43,7 @@ _COUNTS = 7, 6  # numbers of a pose with its time, and of a .pincam
 # Seconds between poses, ten in each, that are still neighbours; between a picture and a pose with
 # no neighbour there, as the data set's own tools have it; between a picture and its camera, whose
 # names are rounded apart; and within which a name in whole ms may be the pose's own.
-_NEIGHBOURS, _BETWEEN, _ROUNDED, _SAME = 0.12, 0.005, 0.0015, 0.00051
+_BETWEEN_POSES, _BETWEEN, _ROUNDED, _SAME_MS = 0.12, 0.005, 0.0015, 0.00051
 
 
 def matches(path: Path) -> bool:
@@ -164,8 +164,8 @@ def _poses_at(times: Double, rows: Double) -> tuple[Bool, Double]:
     before = np.maximum(after - 1, 0)
     gap, since, until = taken[after] - taken[before], times - taken[before], taken[after] - times
     nearest = np.minimum(abs(since), abs(until))
-    within = (since >= 0) & (until >= 0) & (gap <= _NEIGHBOURS)
-    even = within & (nearest > _SAME)
+    within = (since >= 0) & (until >= 0) & (gap <= _BETWEEN_POSES)
+    even = within & (nearest > _SAME_MS)
     share = np.where(even, since / np.where(even, gap, 1), abs(until) < abs(since))[:, None]
     steps = (turns[before].inv() * turns[after]).as_rotvec()
     poses = np.tile(np.eye(4), (len(times), 1, 1))
