@@ -120,6 +120,7 @@ def _project(folder, room):
     for node, file, made in (
         ("CameraInit", "cameraInit.sfm", json.dumps(photographs)),
         ("StructureFromMotion", "cameras.sfm", (folder / "cameras.sfm").read_text()),
+        ("MeshFiltering", "mesh.obj", (folder / "texturedMesh.obj").read_text()),
         ("Texturing", "texturedMesh.obj", (folder / "texturedMesh.obj").read_text()),
     ):
         place = folder / "MeshroomCache" / node / "5ac2b90d"
@@ -157,8 +158,23 @@ def test_of_several_results_nobody_knows_which_belong_together(tmp_path):
     with pytest.raises(MeshMissing, match="or name one with --mesh"):
         read_scan(tmp_path, OPTIONS)
     shutil.copytree(cache / "StructureFromMotion/5ac2b90d", cache / "StructureFromMotion/77")
-    with pytest.raises(InputRefused, match="2 nodes of the project have found cameras"):
+    with pytest.raises(InputRefused, match="2 results of the project have cameras"):
         read_scan(tmp_path, OPTIONS)
+
+
+def test_what_a_later_node_made_comes_first(tmp_path):
+    """SfMTransform turns what StructureFromMotion has found, and is what is meshed."""
+    room, cache = truth(), _project(tmp_path, truth()) / "MeshroomCache"
+    (cache / "SfMTransform/1b").mkdir(parents=True)
+    found = cache / "StructureFromMotion/5ac2b90d/cameras.sfm"
+    found.rename(cache / "SfMTransform/1b/cameras.sfm")
+    moved = _document(room)
+    for row in moved["poses"]:
+        row["pose"]["transform"]["center"] = _texts([9, 9, 9])
+    found.write_text(json.dumps(moved))
+    shutil.copytree(cache / "MeshFiltering/5ac2b90d", cache / "MeshFiltering/77")
+    poses = np.diag([*OPENGL, 1.0]) @ room.world_from_camera[_order()]
+    assert_same(read_scan(tmp_path, OPTIONS), room, points=room.points * OPENGL, poses=poses)
 
 
 def _fov(plane, terms):
@@ -240,6 +256,20 @@ def test_cameras_of_a_rig_stand_where_its_pose_and_their_own_in_it_say(tmp_path,
     scan = read_scan(tmp_path, OPTIONS)
     poses = np.diag([*OPENGL, 1.0]) @ room.world_from_camera[_order()]
     assert_same(scan, room, points=room.points * OPENGL, poses=poses)
+
+
+def test_brackets_in_a_rig_that_was_never_solved_stand_where_their_pose_says(tmp_path):
+    """They share it, and do not state that it is not the rig's, as which no flag counts."""
+    room, document = truth(), _document(truth())
+    for i, view in enumerate(document["views"]):
+        view |= {"rigId": "5", "subPoseId": str(i % 2)}
+    document["views"][1]["poseId"] = document["views"][0]["poseId"]
+    document["rigs"] = [{"rigId": "5", "subPoses": [{"status": "uninitialized"}] * 2}]
+    shots = shots_of(document, (1, 2, 11), tmp_path)
+    poses = np.diag([*OPENGL, 1.0]) @ room.opencv
+    for shot, pose in zip(shots, poses[[0, 0, *range(2, 10)]], strict=True):
+        assert shot.problem == ""
+        np.testing.assert_allclose(shot.world_from_camera, pose, atol=1e-12)
 
 
 def test_views_that_no_rig_places_and_without_a_pose_are_left_out(tmp_path):

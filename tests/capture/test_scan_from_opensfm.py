@@ -4,6 +4,7 @@ distortions of camera_distortions_functions.h."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,6 +79,34 @@ def test_undistorted_pictures_do_not_go_with_the_original_lens(tmp_path):
     (tmp_path / "images").rename(tmp_path / "undistorted/images")
     with pytest.raises(InputRefused, match=r"bends light.*\[capture.camera\]"):
         read_scan(tmp_path, OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("frames", "refused"),
+    [
+        ("kitchen_undistorted/undistorted_images/a", True),
+        ("kitchen_undistorted/images", False),
+        ("kitchen_undistorted", False),  # flat: what a whole project is called says nothing
+        ("undistortion_study/images", False),
+        ("originals_not_undistorted/jpg", False),
+        ("Undistorted/images", True),
+        ("undistorted_images", True),
+        ("photos/undistorted_images", True),
+    ],
+)
+def test_only_what_folders_of_pictures_are_called_refuses_them(tmp_path, frames, refused):
+    base, place = tmp_path / "kitchen_undistorted", tmp_path / frames
+    base.mkdir()
+    _write(base, truth(), [_part(truth(), kind="brown", k1=-0.1)])
+    place.mkdir(parents=True, exist_ok=True)
+    for picture in list((base / "images").rglob("*.jpg")):
+        picture.rename(place / picture.name)
+    options = replace(OPTIONS, frames=None if place == base else place)
+    if not refused:
+        assert len(read_scan(base, options).frames) == 10
+        return
+    with pytest.raises(InputRefused, match=r"rename the folder.*\[capture.camera\]"):
+        read_scan(base, options)
 
 
 def test_a_folder_may_be_called_opensfm(tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -43,6 +45,14 @@ def _perspective(room, radial=(0, 0, 0), tangential=(0, 0)):
     }
 
 
+def _system(*metres):
+    """A coordinate system in WKT whose axes have units of these lengths."""
+    axes = ",".join(f'AXIS["x",up,ORDER[1],LENGTHUNIT["some unit",{unit}]]' for unit in metres)
+    turn = 'PRIMEM["Greenwich",0,ANGLEUNIT["degree",0.0174532925199433]]'
+    earth = 'ELLIPSOID["WGS 84",6378137,298.257223563,LENGTHUNIT["metre",1]]'
+    return f'PROJCRS["x",BASEGEOGCRS["x",DATUM["x",{earth}],{turn}],CS[Cartesian,3],{axes}]'
+
+
 def _documents(room, internals=None, uri=lambda i: f"photos/{i:04d}.jpg"):
     """Of each kind its format and what it says."""
     cameras = [
@@ -62,7 +72,10 @@ def _documents(room, internals=None, uri=lambda i: f"photos/{i:04d}.jpg"):
         "camera-list": {"cameras": listed},
         "input-cameras": {"sensors": [size], "captures": []},
         "calibrated-cameras": {"sensors": [sensor], "cameras": cameras},
-        "scene-reference-frame": {"crs": {"definition": "EPSG:32616"}, "base_to_canonical": shift},
+        "scene-reference-frame": {
+            "crs": {"definition": _system("1.0")},
+            "base_to_canonical": shift,
+        },
     }
 
 
@@ -88,6 +101,9 @@ def _write(folder, room, documents):
         lambda i: f"photos/{i:04d}.jpg",
         lambda i: f"file:///c:/my%20data/{i:04d}.jpg",
         lambda i: f"{i:04d}.jpg#page=0",
+        # No URIs, though they begin as such.
+        lambda i: f"file://[x/{i:04d}.jpg",
+        lambda i: f"//a\u2100b/{i:04d}.jpg",
     ],
 )
 def test_the_project_is_the_room(tmp_path, uri):
@@ -97,6 +113,7 @@ def test_the_project_is_the_room(tmp_path, uri):
     scan = read_scan(tmp_path, OPTIONS)
     assert_same(scan, room, names=room.names)
     assert (scan.adapter, scan.up_axis, scan.meters_per_unit) == ("opf", "Z", 1.0)
+    assert not any("--meters-per-unit" in said for said in scan.warnings)
 
 
 def _bent(folder, internals):
@@ -148,6 +165,37 @@ def test_what_is_no_photograph_of_the_calibration_is_left_out(tmp_path):
     assert "capture.shutter" in said
 
 
+@pytest.mark.parametrize(
+    "frame",
+    [
+        {},
+        {"crs": {}},
+        {"crs": {"definition": "EPSG:2229+6360"}},  # in feet, which its authority alone knows
+        {"crs": {"definition": _system("0.3048")}},
+        {"crs": {"definition": _system("1", "0.304800609601219")}},
+        {"crs": {"definition": _system("1") + 'UNIT["x",0.3]'}},
+    ],
+)
+def test_a_coordinate_system_not_known_to_be_in_metres_is_told(tmp_path, frame):
+    room, documents = truth().square(), _documents(truth().square())
+    documents["scene-reference-frame"] = frame
+    _write(tmp_path, room, documents)
+    told = [said for said in read_scan(tmp_path, OPTIONS).warnings if "capture.unit" in said]
+    assert ["--meters-per-unit" in said for said in told] == [True]
+    scan = read_scan(tmp_path, replace(OPTIONS, meters_per_unit=0.3048))
+    assert not any("capture.unit" in said for said in scan.warnings)
+
+
+def test_parts_may_be_named_by_where_the_file_lies(tmp_path):
+    project = _write(tmp_path, truth().square(), _documents(truth().square())) / "room.opf"
+    folder = f"file://{quote(str(tmp_path.resolve()))}"
+    project.write_text(project.read_text().replace('"parts/', f'"{folder}/parts/'))
+    assert_same(read_scan(tmp_path, OPTIONS), truth().square())
+    project.write_text(project.read_text().replace(folder, "file:///elsewhere"))
+    with pytest.raises(InputRefused, match="only relative paths"):
+        read_scan(tmp_path, OPTIONS)
+
+
 def test_without_a_reference_frame_nobody_knows_the_scale(tmp_path):
     room, documents = truth().square(), _documents(truth().square())
     del documents["scene-reference-frame"]
@@ -159,7 +207,14 @@ def test_without_a_reference_frame_nobody_knows_the_scale(tmp_path):
     ("change", "words"),
     [
         (lambda d: d.pop("calibrated-cameras"), "no calibrated cameras"),
-        (lambda d: d["calibrated-cameras"]["sensors"][0]["internals"].update(type="x"), "'x'"),
+        (
+            lambda d: d["calibrated-cameras"]["sensors"][0]["internals"].update(type="x"),
+            "'x'.*transforms",
+        ),
+        (
+            lambda d: d["calibrated-cameras"]["sensors"][0]["internals"].pop("type"),
+            "no stated type",
+        ),
         (lambda d: d["calibrated-cameras"].update(cameras=[]), "frames"),
     ],
 )

@@ -92,7 +92,12 @@ DOCUMENTS = [
     ("00.txt", 3 * "1e0 0 0 0 0 1 0 0 0 0 1 0\n", "KITTI", "a transforms.json"),
     ("trajectory_gt.txt", 3 * f"{'1.5 ' * 16}\n", "Replica for NICE-SLAM", "traj.txt"),
     ("groundtruth.txt", 3 * "1311868164.36 0 0 0 0 0 0 1\r\n", "TUM RGB-D", "fuse the"),
-    ("0007.txt", 4 * "1 0 -0.5 1e-3\n", "a data set with a file of each camera", "in it"),
+    (
+        "0007.txt",
+        3 * "1 0 -0.5 1e-3\n" + "0 -0.0 0e0 1.0e+00\n",
+        "a data set with a file of each camera",
+        "in it",
+    ),
     ("database.db", "SQLite format 3\x00", "COLMAP", "colmap mapper"),
 ]
 
@@ -138,6 +143,8 @@ def test_a_document_that_names_no_program_is_none_of_theirs(tmp_path):
 def test_tables_of_other_numbers_are_no_cameras(tmp_path):
     for name, row in (("points.xyz", "1 2 3\n"), ("weights.txt", "1 0 0 0\n")):
         (tmp_path / name).write_text(row * 5)
+    for rows in (3, 4):
+        (tmp_path / f"boxes_{rows}.txt").write_text("12 40 3.5 1\n" * rows)
     assert "neither pictures nor cameras" in _refused(tmp_path)
 
 

@@ -200,8 +200,9 @@ def test_settings_of_a_user_that_are_no_table_are_named(
         files_at(f"s3://{BUCKET}/prefix", tmp_path)
 
 
-def test_a_file_of_settings_that_is_no_json_is_named(tmp_path: Path) -> None:
-    (tmp_path / "conf.json").write_text("{no JSON")
+@pytest.mark.parametrize("text", ["{no JSON", "[1]", "5", "[[]]", "null"])
+def test_a_file_of_settings_that_is_no_table_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "conf.json").write_text(text)
     program = "from usdbrdf.cluster.object_store import refuse_unknown; refuse_unknown('s3://a')"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False,

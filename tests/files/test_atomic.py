@@ -26,6 +26,7 @@ from usdbrdf.files.atomic import (
     failure_of_machine,
     flush_folder,
     publish,
+    raise_shortage,
     sha256_of,
     temporary_beside,
     temporary_folder,
@@ -441,3 +442,44 @@ def test_only_errors_of_permission_disk_files_and_threads_are_the_machine_s():
         RuntimeError("y"),
     ):
         assert failure_of_machine(defect) is None
+
+
+def _answered(answer):
+    """The error by which a library answers a disk that fails."""
+    try:
+        try:
+            raise OSError(errno.EIO, "Input/output error")
+        except OSError as disk:
+            answer(disk)
+    except Exception as error:
+        return error
+
+
+def _no_zip(disk):
+    raise ValueError("not a zip file")
+
+
+def _no_zip_because(disk):
+    raise ValueError("not a zip file") from disk
+
+
+def _row_3(disk):
+    raise ValueError("row 3") from None
+
+
+@pytest.mark.parametrize("answer", [_no_zip, _no_zip_because])
+def test_a_disk_that_fails_is_told_whatever_a_library_makes_of_it(answer):
+    with pytest.raises(EnvironmentFailure, match="Input/output error"):
+        raise_shortage(_answered(answer))
+
+
+def test_what_a_library_says_has_nothing_to_do_with_its_error_is_not_looked_at():
+    raise_shortage(_answered(_row_3))
+
+
+@pytest.mark.parametrize("length", [1, 3])
+def test_errors_that_are_their_own_cause_come_to_an_end(length):
+    errors = [ValueError(str(i)) for i in range(length)]
+    for error, cause in zip(errors, errors[1:] + errors[:1], strict=True):
+        error.__cause__ = cause
+    raise_shortage(errors[0])

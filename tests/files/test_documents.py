@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from usdbrdf.errors import InputRefused, UsdBrdfError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
 from usdbrdf.files import documents
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.tables import csv_rows
@@ -117,6 +119,16 @@ def test_not_a_regular_file(tmp_path):
     for path in (tmp_path, tmp_path / "fifo", tmp_path / "none", tmp_path / ("x" * 300)):
         with pytest.raises(InputRefused, match=r"\[document\.missing\]$"):
             read_json(path)
+
+
+def test_a_disk_that_fails_is_not_the_document_s_fault(tmp_path, monkeypatch):
+    def fails(path):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    (tmp_path / "doc.json").write_text("{}")
+    monkeypatch.setattr(Path, "read_bytes", fails)
+    with pytest.raises(EnvironmentFailure, match=r"doc\.json: .*\[environment\.io\]$"):
+        read_json(tmp_path / "doc.json")
 
 
 def test_written_documents_read_back_and_do_not_depend_on_order(tmp_path):

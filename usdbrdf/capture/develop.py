@@ -26,6 +26,7 @@ from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.colour import kind_of_encoding, linear_space_of
 from usdbrdf.files.frames import CLIPPED_SHARE, read_recorded
 from usdbrdf.files.images import needs_float, read_radiance, white_of_mask, write_exr
+from usdbrdf.files.naming import is_called_undistorted
 from usdbrdf.job.progress import progress
 from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Long
@@ -223,20 +224,6 @@ def with_rims(
     )
     concerned = set(undistorted)
     return [replace(record, rim=record.image_path in concerned) for record in records]
-
-
-def is_called_undistorted(picture: Path, places: tuple[Path, Path | None]) -> bool:
-    """Whether a folder that a picture lies in is called so.
-
-    places  the capture's folder, and the user's of the pictures: the names of folders below that
-            say what these are; of the user's elsewhere its own and the next, as what a whole
-            project is called says nothing
-    """
-    folder, frames = places
-    folders = [folder, *([] if frames is None else frames.resolve().parents[:2][-1:])]
-    home = next((folder for folder in folders if picture.is_relative_to(folder)), None)
-    names = picture.relative_to(home).parent.parts if home else (picture.parent.name,)
-    return any("undistort" in name.lower() for name in names)
 
 
 def _is_black_in_a_corner(picture: Path) -> bool:

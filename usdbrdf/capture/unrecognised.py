@@ -73,8 +73,10 @@ _EXAMPLE = "the example of an adapter, plugins/example_adapter of our sources"
 _AS_USD = "Export cameras and meshes as USD, and convert that"
 _NOTHING = rb"(?!)"
 
-# The beginning of a table: three rows of one number and so many before it.
+# The beginning of a table: three rows of one number and so many before it; and the last row of four
+# that turn and move, without which they may be any numbers.
 _TABLE = rb"\A(?:[ \t]*(?:[-+.\deE]+[ \t,]+){%b}[-+.\deE]+[ \t]*\r?\n){3}"
+_OF_A_POSE = rb"[ \t]*(?:-?0(?:\.0*)?(?:[eE][-+]?\d+)?[ \t,]+){3}1(?:\.0*)?(?:[eE][-+]?0+)?\s*\Z"
 _PROGRAMS = (
     _Program(
         "OpenMVG", ("sfm_data.bin", "sfm_data.xml"), (), _NOTHING,
@@ -264,7 +266,7 @@ _PROGRAMS = (
         "TUM RGB-D", (), (), _TABLE % b"7", f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
     ),
     _Program(
-        "a data set with a file of each camera", (), (), _TABLE % b"3" + rb"[^\n]*\s*\Z",
+        "a data set with a file of each camera", (), (), _TABLE % b"3" + _OF_A_POSE,
         f"{_BY_HAND}, and name the scene's mesh in it",
     ),
     _Program(

@@ -309,7 +309,10 @@ def refuse_unknown(address: str) -> None:
     installed; nobody is asked for it yet."""
     try:
         from fsspec import get_filesystem_class
-    except (ValueError, configparser.Error, OSError) as error:  # files of settings are read first
+    # Files of settings are read first, and what is no table of tables is not looked for.
+    except (
+        ValueError, TypeError, LookupError, AttributeError, configparser.Error, OSError,
+    ) as error:  # fmt: skip
         folder = os.environ.get("FSSPEC_CONFIG_DIR", "~/.config/fsspec")
         raise UsageError(
             f"--shared-folder {address}: a file of fsspec's settings in {folder} cannot be read "

@@ -297,13 +297,15 @@ def raise_shortage(error: BaseException | None) -> None:
     reader stumbled: threads, open files, memory, a disk that fails. Permission is the file's.
 
     Libraries answer an error with one of their own, zipfile a failing read with "not a zip file",
-    so that those before it are looked at too."""
-    while error is not None:
+    so that those before it are looked at too, unless it says that they do not matter."""
+    seen = set[int]()  # an error that was raised from itself is its own cause
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
         if isinstance(error, Exception) and not isinstance(error, PermissionError):
             failure = failure_of_machine(error)
             if failure is not None:
                 raise failure from error
-        error = error.__cause__ or error.__context__
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
 
 
 def _place_of(error: OSError) -> object:

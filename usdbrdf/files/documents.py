@@ -117,7 +117,7 @@ def json_text(obj: Any) -> str:
 
 def read_text(path: Path) -> str:
     """A whole file of UTF-8, of UTF-16 with its mark, or of XML in what it says that it is in,
-    within ``MAX_BYTES``; InputRefused otherwise."""
+    within ``MAX_BYTES``; InputRefused otherwise, unless it is the machine that fails."""
     try:
         if not path.is_file():  # a FIFO or device would block or never end
             raise InputRefused(f"{path}: no such file, or not a regular one. [document.missing]")
@@ -132,6 +132,8 @@ def read_text(path: Path) -> str:
         content = path.read_bytes()
         return content.decode(encoding_of_text(content))
     except OSError as error:
+        error.filename = error.filename or str(path)  # a read that fails does not say of what
+        raise_shortage(error)
         raise InputRefused(
             f"{path}: cannot be read ({error.strerror}). Check its permissions. [document.missing]"
         ) from error

@@ -1,4 +1,5 @@
-"""Names as captured -> USD identifiers that are also safe as file names everywhere."""
+"""Names as captured -> USD identifiers that are also safe as file names everywhere; and what the
+names of pictures and their folders say."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ import hashlib
 import re
 import unicodedata
 from collections.abc import Callable, Collection, Sequence
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 _MAX_LENGTH = 64
 # Device names that Windows refuses as a file's stem, whatever the extension.
@@ -83,3 +84,37 @@ def number_at_end(name: str) -> int:
     """The number that a name without suffix ends with, -1 where it ends with none."""
     digits = re.search(r"(\d+)$", name)
     return int(digits[1]) if digits else -1
+
+
+def is_called_undistorted(picture: Path, places: tuple[Path, Path | None]) -> bool:
+    """Whether a folder that a picture lies in is called so.
+
+    places  the capture's folder, and the user's of the pictures: the names of folders below that
+            say what these are; of the user's elsewhere its own and the next, as what a whole
+            project is called says nothing
+    """
+    folder, frames = places
+    folders = [folder, *([] if frames is None else frames.resolve().parents[:2][-1:])]
+    home = next((folder for folder in folders if picture.is_relative_to(folder)), None)
+    names = picture.relative_to(home).parent.parts if home else (picture.parent.name,)
+    return any("undistort" in name.lower() for name in names)
+
+
+def must_be_undistorted(picture: Path, places: tuple[Path, Path | None]) -> bool:
+    """Whether a folder says of a picture that it has been undistorted so clearly that a lens which
+    bends light cannot be its own: more is asked than by ``is_called_undistorted``, after which one
+    only looks.
+
+    places  as there. Below the capture's folder any name counts; of the user's elsewhere its own
+            and those below it, and ``undistorted`` next above, as OpenSfM has it
+    """
+    folder, frames = places[0], places[1] and places[1].resolve()
+    if picture.is_relative_to(folder):
+        names = picture.relative_to(folder).parent.parts
+    elif frames and picture.is_relative_to(frames):
+        if frames.parent.name.lower() == "undistorted":
+            return True
+        names = (frames.name, *picture.relative_to(frames).parent.parts)
+    else:
+        names = (picture.parent.name,)
+    return any("undistort" in name.lower() for name in names)

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
-from usdbrdf.capture.develop import is_called_undistorted, with_rims
+from usdbrdf.capture.develop import with_rims
 from usdbrdf.capture.parts import (
     LabelTable,
     as_photographs,
@@ -26,7 +26,7 @@ from usdbrdf.capture.parts import (
 from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
-from usdbrdf.files.naming import meant_by, number_at_end
+from usdbrdf.files.naming import meant_by, must_be_undistorted, number_at_end
 from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
@@ -413,12 +413,12 @@ def scan_of(
     radiometric  False of linear images that 8-bit photographs became
     """
     for record in records:
-        called = is_called_undistorted(record.image_path, (folder, options.frames))
-        if record.lens.bends and (called or "undistort" in record.image_path.parent.name.lower()):
+        if record.lens.bends and must_be_undistorted(record.image_path, (folder, options.frames)):
             raise InputRefused(
-                f"{record.image_path}: a picture that has been undistorted, but the lens of "
-                f"{record.name!r} in {source.name} bends light. Bring the original pictures, or "
-                "the cameras that were exported for these. [capture.camera]"
+                f"{record.image_path}: a picture that has been undistorted, as its folder is "
+                f"called, but the lens of {record.name!r} in {source.name} bends light. Bring the "
+                "original pictures, or the cameras that were exported for these; or rename the "
+                "folder, if these are the originals. [capture.camera]"
             )
     records = with_rims(records, (folder, options.frames), findings, source)
     if masks := sum(record.mask_path is not None for record in records):

@@ -9,6 +9,7 @@ have one of their own for each. Pixel centres are whole numbers.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.named_pictures import pictures_of, rigid_pose
+from usdbrdf.capture.formats.named_pictures import SUFFIXES, pictures_of
 from usdbrdf.capture.reconstructions.shots import (
     Shot,
     ShotCamera,
@@ -26,10 +27,11 @@ from usdbrdf.capture.reconstructions.shots import (
 )
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.paths import seen_of
-from usdbrdf.files.tables import number_in, number_rows
-from usdbrdf.model.arrays import Double
+from usdbrdf.files.tables import files_of, number_in, number_rows
+from usdbrdf.model.arrays import Bool, Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import CaptureOptions
+from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 
 NAME = "arkitscenes"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -38,27 +40,31 @@ _TRAJECTORY, _FRAMES = "lowres_wide.traj", "_frames"
 _PICTURES = ("wide", "vga_wide", "lowres_wide")
 _MESHES = ("*_3dod_mesh.ply", "mesh.*")
 _COUNTS = 7, 6  # numbers of a pose with its time, and of a .pincam
-# Between the times of a picture and of its pose, as the data set's own tools have it; and of a
-# picture and its camera, whose names are rounded apart.
-_BETWEEN, _ROUNDED = 0.005, 0.0015
+# Seconds between poses, ten in each, that are still neighbours; between a picture and a pose with
+# no neighbour there, as the data set's own tools have it; between a picture and its camera, whose
+# names are rounded apart; and within which a name in whole ms may be the pose's own.
+_BETWEEN_POSES, _BETWEEN, _ROUNDED, _SAME_MS = 0.12, 0.005, 0.0015, 0.00051
 
 
 def matches(path: Path) -> bool:
-    """A folder with the trajectory, or with a folder of frames that has it."""
+    """The trajectory, a folder with it, or with a folder of frames that has it."""
     return bool(_trajectories(path))
 
 
 def _trajectories(path: Path) -> list[Path]:
     if not path.is_dir():
-        return []
+        return [path] if path.name == _TRAJECTORY and path.is_file() else []
     places = (_TRAJECTORY, f"*{_FRAMES}/{_TRAJECTORY}")
     return [file for place in places for file in seen_of(path.glob(place)) if file.is_file()]
 
 
 def _home(path: Path) -> Path:
-    """The capture's folder: that of the video, where its frames' folder is named."""
+    """The capture's folder: that of the video, where its frames' folder is named; one that is only
+    called so has the mesh itself."""
     folder = capture_folder_of(path)
-    return folder.parent if folder.name.endswith(_FRAMES) else folder
+    if not folder.name.endswith(_FRAMES) or files_of(folder, MESH_SUFFIXES):
+        return folder
+    return folder.parent
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:
@@ -91,12 +97,13 @@ def beside(path: Path) -> list[Path]:
 
 
 def _places(source: Path, folder: Path) -> tuple[str, ...]:
-    """The folder of pictures, below the capture's: the first that has their cameras beside it."""
+    """The folder of pictures, below the capture's: the first that has any, with cameras beside."""
     inside = source.parent.relative_to(folder)
     whole = (
         name
         for name in _PICTURES
-        if (source.parent / name).is_dir() and (source.parent / f"{name}_intrinsics").is_dir()
+        if files_of(source.parent / name, SUFFIXES)
+        and files_of(source.parent / f"{name}_intrinsics", [".pincam"])
     )
     return ((inside / next(whole, _PICTURES[-1])).as_posix(),)
 
@@ -108,33 +115,34 @@ def shots_of(source: Path, options: CaptureOptions, findings: Findings) -> list[
         raise InputRefused(
             f"{source}: not rows of a time and six numbers. Download it again. [capture.format]"
         )
-    poses = np.stack(rows)
     folder = _home(source)
     places = _places(source, folder)
     cameras = _by_time(seen_of((folder / f"{places[0]}_intrinsics").glob("*.pincam")))
-    found, apart = [], 0
-    for time, picture in sorted(
-        _by_time(list(pictures_of(folder, options, *places).paths)).items()
-    ):
-        pose = poses[np.abs(poses[:, 0] - time).argmin()]
-        if abs(pose[0] - time) > _BETWEEN:
-            apart += 1
-            continue
+    pictures = sorted(_by_time(pictures_of(folder, options, *places).paths).items())
+    known, poses = _poses_at(np.array([time for time, _ in pictures]), np.stack(rows))
+    found = []
+    for (time, picture), pose in zip(pictures, poses, strict=True):
         nearest = min(cameras, key=lambda other: abs(other - time), default=np.inf)
         near = abs(nearest - time) <= _ROUNDED
         found.append(
             Shot(
                 name=picture.name,
                 camera=_camera(cameras[nearest]) if near else None,
-                world_from_camera=_pose(pose),
+                world_from_camera=pose,
             )
+        )
+    apart = len(pictures) - int(known.sum())
+    if pictures and not known.any():
+        raise InputRefused(
+            f"{source}: none of the {apart} pictures, first {pictures[0][1].name!r}, was taken "
+            "when it has poses. Download pictures and trajectory of one video. [capture.alignment]"
         )
     if apart:
         findings.warn(
             f"{source.name}: {apart} pictures were taken between its poses, and are passed over. "
             "[capture.unused]"
         )
-    return found
+    return list(compress(found, known))
 
 
 def _by_time(files: Iterable[Path]) -> dict[float, Path]:
@@ -143,12 +151,27 @@ def _by_time(files: Iterable[Path]) -> dict[float, Path]:
     return {time: file for file, time in times.items() if time is not None}
 
 
-def _pose(row: Double) -> Double | None:
-    """(4, 4) world from camera."""
-    if not np.isfinite(row).all():
-        return None
-    turn = Rotation.from_rotvec(row[1:4]).as_matrix().T
-    return rigid_pose(turn, -turn @ row[4:])
+def _poses_at(times: Double, rows: Double) -> tuple[Bool, Double]:
+    """Which (N,) times the trajectory has a pose for, and the poses (N, 4, 4), world from camera:
+    between two rows that are neighbours in time evenly turned and moved, else the nearest row's."""
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+    if not len(rows) or not len(times):
+        return np.zeros(len(times), np.bool_), np.tile(np.eye(4), (len(times), 1, 1))
+    turns, taken = Rotation.from_rotvec(rows[:, 1:4]).inv(), rows[:, 0]
+    centres = -turns.apply(rows[:, 4:])
+    after = np.minimum(np.searchsorted(taken, times), len(rows) - 1)
+    before = np.maximum(after - 1, 0)
+    gap, since, until = taken[after] - taken[before], times - taken[before], taken[after] - times
+    nearest = np.minimum(abs(since), abs(until))
+    within = (since >= 0) & (until >= 0) & (gap <= _BETWEEN_POSES)
+    even = within & (nearest > _SAME_MS)
+    share = np.where(even, since / np.where(even, gap, 1), abs(until) < abs(since))[:, None]
+    steps = (turns[before].inv() * turns[after]).as_rotvec()
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, :3] = (turns[before] * Rotation.from_rotvec(share * steps)).as_matrix()
+    poses[:, :3, 3] = (1 - share) * centres[before] + share * centres[after]
+    return within | (nearest <= _BETWEEN), poses
 
 
 def _camera(file: Path) -> ShotCamera | None:

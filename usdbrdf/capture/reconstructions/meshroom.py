@@ -10,7 +10,6 @@ pose is the rig's, and each camera has its own within it.
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +48,10 @@ _SINCE: dict[str, Version] = {
     "focalLength is the second": (1, 2, 11),
     "newest": (1, 2, 12),
 }
-# Where a project keeps what its nodes have made, those of them that find or turn cameras, and what
-# those make that mesh; beside a document that was taken from there, the same names.
-_CACHE, _NODES = "MeshroomCache", ("StructureFromMotion", "SfMTransform")
+# Where a project keeps what its nodes have made, those of them that turn or find cameras, and what
+# those make that mesh, each before what it works on; beside a document that was taken from there,
+# the same names.
+_CACHE, _NODES = "MeshroomCache", ("SfMTransform", "StructureFromMotion")
 _TEXTURED = (("Texturing", "texturedMesh.obj"), ("MeshFiltering", "mesh.obj"))
 _BESIDE = ("texturedMesh.*", "mesh.*")
 _OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -68,9 +68,10 @@ def matches(path: Path) -> bool:
 
 
 def _in_cache(path: Path) -> list[Path]:
-    """What the nodes that find cameras have left in a project's folder."""
+    """What the last of the nodes that find cameras has left in a project's folder."""
     cache = path if path.name == _CACHE else path / _CACHE
-    return [file for node in _NODES for file in seen_of(cache.glob(f"{node}/*/cameras.sfm"))]
+    found = (seen_of(cache.glob(f"{node}/*/cameras.sfm")) for node in _NODES)
+    return next(filter(None, found), [])
 
 
 def _home(source: Path) -> Path:
@@ -90,9 +91,11 @@ def beside(path: Path) -> list[Path]:
 
 
 def _meshes(home: Path) -> tuple[str, ...]:
-    """Patterns of its own names; those in the cache where one node alone has made one."""
-    made = [f"{_CACHE}/{node}/*/{name}" for node, name in _TEXTURED]
-    return (*_BESIDE, *(pattern for pattern in made if len(list(home.glob(pattern))) == 1))
+    """Patterns of its own names; that in the cache of the last node that has made any, if one."""
+    made = (f"{_CACHE}/{node}/*/{name}" for node, name in _TEXTURED)
+    counts = ((pattern, len(list(home.glob(pattern)))) for pattern in made)
+    last, count = next(((pattern, count) for pattern, count in counts if count), ("", 0))
+    return (*_BESIDE, last) if count == 1 else _BESIDE
 
 
 def _documents(path: Path) -> list[Path]:
@@ -108,7 +111,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     cached = [] if documents else _in_cache(path.resolve())
     if len(cached) > 1:
         raise InputRefused(
-            f"{path}: {len(cached)} nodes of the project have found cameras, first "
+            f"{path}: {len(cached)} results of the project have cameras, first "
             f"{cached[0]}. Name the cameras.sfm of the one that the mesh was made with. "
             "[capture.format]"
         )
@@ -171,17 +174,18 @@ def shots_of(document: object, version: Version, source: Path) -> list[Shot]:
         for number, place in enumerate(rows_of(row, "subPoses"))
     }
     views = rows_of(document, "views")
-    shared = Counter(str(view.get("poseId")) for view in views)
     found = []
     for view in views:
         pose, problem = poses.get(str(view.get("poseId"))), ""
-        # Of a rig one pose is that of all its cameras, unless each has its own.
-        together = "true" if shared[str(view.get("poseId"))] == 1 else "false"
-        apart = str(view.get("isPoseIndependant", together)).lower() in ("true", "1")
-        if "rigId" in view and not apart and pose is not None:
+        # Of a rig one pose is that of all its cameras, unless each has its own. Where that is not
+        # stated (brackets share a pose, too), it has a place in the rig if one was found.
+        stated = view.get("isPoseIndependant")
+        if "rigId" in view and str(stated).lower() not in ("true", "1") and pose is not None:
             place = rig_from_camera.get((str(view["rigId"]), str(view.get("subPoseId"))))
-            problem = "nothing says where it stands in its rig" if place is None else ""
-            pose = pose if place is None else pose @ place
+            if place is not None:
+                pose = pose @ place
+            elif stated is not None:
+                problem = "nothing says where it stands in its rig"
         found.append(
             Shot(
                 name=str(view.get("path") or view.get("viewId")),

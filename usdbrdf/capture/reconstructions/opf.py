@@ -7,7 +7,8 @@ project's processing frame, near its origin. Lenses are Pix4D's; the picture's c
 
 from __future__ import annotations
 
-from pathlib import Path
+import re
+from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
@@ -21,7 +22,7 @@ from usdbrdf.capture.formats.named_pictures import path_in_capture, rigid_pose
 from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, rows_of, scan_of_shots
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
-from usdbrdf.files.tables import beginning_of, files_of, numbers_among
+from usdbrdf.files.tables import beginning_of, files_of, number_in, numbers_among
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens, fisheye_of_turn, is_fisheye_of_turn, whole_sphere
@@ -34,6 +35,9 @@ _PICTURES, _SENSORS, _CAMERAS, _FRAME = (
     f"application/opf-{name}+json"
     for name in ("camera-list", "input-cameras", "calibrated-cameras", "scene-reference-frame")
 )
+# Of a coordinate system in WKT each unit but angles', and how many metres it is. UNIT alone may be
+# either, so that a text with one tells nothing certain.
+_UNIT = re.compile(r'\b(?:LENGTH)?UNIT\s*[\[(]\s*"[^"]*"\s*,\s*([^\s,\])]+)', re.IGNORECASE)
 
 
 def matches(path: Path) -> bool:
@@ -69,6 +73,12 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             f"{source.name}: states a rolling_shutter, which is not undone: what a camera took "
             "while it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
         )
+    systems = [_system(frame) for frame in frames]
+    if options.meters_per_unit is None and not all(map(_in_metres, systems)):
+        findings.warn(
+            f"{source.name}: nothing says that its coordinate system ({systems[0][:40]!r}) is in "
+            "metres; taken are metres. State --meters-per-unit. [capture.unit]"
+        )
     return scan_of_shots(
         shots_of(lists, sensors, cameras[0], source),
         options,
@@ -84,13 +94,25 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     )
 
 
+def _system(frame: object) -> str:
+    """The definition of a scene reference frame's coordinate system, "" where none is stated."""
+    system = frame.get("crs") if isinstance(frame, dict) else None
+    return str(system.get("definition", "")) if isinstance(system, dict) else ""
+
+
+def _in_metres(system: str) -> bool:
+    """Whether a definition says so: in WKT; of codes of an authority only it knows the unit."""
+    units = _UNIT.findall(system)
+    return bool(units) and all(number_in({"": unit}, "") == 1 for unit in units)
+
+
 def _resources(source: Path, kind: str, options: CaptureOptions) -> list[Any]:
     """The documents of a kind that the project names, in its order."""
     found = []
     for item in rows_of(read_json(source), "items"):
         for resource in rows_of(item, "resources"):
             if resource.get("format") == kind:
-                place = unquote(str(resource.get("uri", "")))
+                place = _place_of(str(resource.get("uri", "")), source.parent)
                 file = path_in_capture(source.parent, place, options)
                 if not file.is_file():
                     raise InputRefused(
@@ -99,6 +121,23 @@ def _resources(source: Path, kind: str, options: CaptureOptions) -> list[Any]:
                     )
                 found.append(read_json(file, unsigned=True))
     return found
+
+
+def _place_of(uri: str, folder: Path) -> str:
+    """What a URI names, relative to the project's folder where it lies there."""
+    if not uri.lower().startswith("file:"):
+        return unquote(uri)
+    path = PurePosixPath(_path_and_page(uri)[0])
+    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
+
+
+def _path_and_page(uri: str) -> tuple[str, str]:
+    """Of a picture's URI; of a text that is none all of it is the path."""
+    try:
+        parts = urlsplit(uri)
+    except ValueError:
+        return unquote(uri), ""
+    return unquote(parts.path), parts.fragment.removeprefix("page=")
 
 
 def shots_of(lists: list[Any], sensors: list[Any], calibrated: object, source: Path) -> list[Shot]:
@@ -119,18 +158,18 @@ def shots_of(lists: list[Any], sensors: list[Any], calibrated: object, source: P
     }
     found = []
     for row in rows_of(calibrated, "cameras"):
-        named = urlsplit(uris.get(number := str(row.get("id")), ""))
+        name, page = _path_and_page(uris.get(number := str(row.get("id")), ""))
         camera, turn = cameras.get(str(row.get("sensor_id")), (None, np.eye(3)))
-        pose, page = _pose(row), named.fragment.removeprefix("page=")
+        pose = _pose(row)
         if pose is not None:
             pose[:3, :3] = pose[:3, :3] @ turn.T
         later = f"it is page {page} of its file" if page not in ("", "0") else ""
         found.append(
             Shot(
-                name=unquote(named.path) or number,
+                name=name or number,
                 camera=camera,
                 world_from_camera=pose,
-                problem=later if named.path else "the list of pictures has none of its number",
+                problem=later if name else "the list of pictures has none of its number",
             )
         )
     return found
@@ -170,10 +209,11 @@ def _camera(stated: object, size: Double | None, source: Path) -> tuple[ShotCame
         lens, focals, turn = fisheye_of_turn(affine, rest)
         return ShotCamera(resolution=resolution, intrinsics=(*focals, cx, cy), lens=lens), turn
     if kind != "perspective":
+        which = "no stated type" if kind is None else f"the type {str(kind)[:40]!r}"
         raise InputRefused(
-            f"{source}: a sensor of the type {str(kind)[:40]!r} is not read (known: perspective, "
-            "fisheye, spherical). Undistort the photographs with pyopf's opf_undistort, and name "
-            "the project that it writes. [capture.camera]"
+            f"{source}: a sensor of {which} is not read (known: perspective, fisheye, spherical). "
+            "Calibrate it as perspective or fisheye; or undistort the photographs elsewhere, and "
+            "bring them with a transforms.json. [capture.camera]"
         )
     focal = numbers_among(said.get("focal_length_px"), 1)
     radial = numbers_among(said.get("radial_distortion"), 3)
