@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 
@@ -137,7 +136,7 @@ def estimate_clipped_light(
 
     def compute() -> dict[str, Array]:
         given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
-        told, wall = _Weighing.of(*given).told()
+        told, wall = _Weighing(*given).told()
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
@@ -157,8 +156,9 @@ def estimate_clipped_light(
     )
 
 
-class _Weighing(NamedTuple):
-    """The ``groups`` and all that tells of their light; chosen, segment (N,): see ``_chosen``."""
+@dataclass(frozen=True)
+class _Weighing:
+    """The ``groups`` and all that tells of their light."""
 
     surface: TexturedScene
     lit: Float
@@ -169,35 +169,33 @@ class _Weighing(NamedTuple):
     said: Mapping[int, bool]
     unseen: Bool | None
     seed: int
-    chosen: Long
-    segment: Int
-    lamp_irradiance: Float
-    asked: Asked | None
 
-    @classmethod
-    def of(
-        cls,
-        surface: TexturedScene,
-        lit: Float,
-        coverage: CoverageMap,
-        frames: Frames,
-        environment: Environment,
-        groups: ClippedGroups,
-        said: Mapping[int, bool],
-        unseen: Bool | None,
-        seed: int,
-    ) -> _Weighing:
-        chosen, segment = _chosen(surface.texels, groups, coverage.measured, seed)
-        each = _of_each(surface, groups, chosen, seed)
-        # With their bounds, whatever light of the sun what clips is taken to reflect.
-        asked = asked_texels(surface.texels, lit, coverage, seed)
-        given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
-        return cls(*given, chosen, segment, each, asked)
+    @cached_property
+    def _chosen(self) -> tuple[Long, Int]:
+        """As of ``_chosen``."""
+        return _chosen(self.surface.texels, self.groups, self.coverage.measured, self.seed)
+
+    @cached_property
+    def _asked(self) -> Asked | None:
+        """With their bounds, whatever light of the sun what clips is taken to reflect."""
+        return asked_texels(self.surface.texels, self.lit, self.coverage, self.seed)
+
+    @cached_property
+    def _of_each(self) -> Float:
+        """(K, N, 3) W/m^2: what each of the groups, at its bound, brings to the texels chosen."""
+        groups, (chosen, _) = self.groups, self._chosen
+        brought = np.zeros((len(groups), len(chosen), 3), np.float32)
+        for k in np.unique(groups.group[groups.group >= 0]):
+            alone = np.where((groups.group == k)[:, None], groups.bound[k], np.float32(0))
+            light = Shining.of(self.surface, np.repeat(alone, 3, axis=1).astype(np.float32))
+            dark, own_seed = black_environment(), self.seed + int(k) + 1
+            brought[k] = irradiance_of_texels(self.surface, light, dark, chosen, own_seed)
+        return brought
 
     def told(self) -> tuple[EstimatedRadiance, Bool]:
         """The estimate, and which of the groups (K,) reflect the light of others than these."""
         groups, wall = self.groups, np.zeros(len(self.groups), np.bool_)
-        if not len(self.chosen):
+        if not len(self._chosen[0]):
             return nothing_known(len(groups)), wall
         told, evenly = self._by(self.lit, groups)
         if self.unseen is not None or self.environment.sun.shines or self._is_day():
@@ -218,15 +216,28 @@ class _Weighing(NamedTuple):
 
     def _by(self, light: Float, groups: ClippedGroups) -> tuple[EstimatedRadiance, Bool]:
         """As of ``_told_by_even_light``."""
-        surface, outside, seed = self.surface, self.environment, self.seed
-        # What a group of no texels brings counts as nothing.
+        first = estimate_clipped_emitters(self._evidence(light, groups))
+        given = light, self._asked, self.frames, self.environment, groups, first, self.seed
+        return _told_by_even_light(self.surface, *given)
+
+    def _evidence(self, light: Float, groups: ClippedGroups) -> Evidence:
+        texels, (chosen, segment) = self.surface.texels, self._chosen
+        rest = np.where(groups.group[:, None] >= 0, np.float32(0), light)
+        shining = Shining.of(self.surface, rest, self.environment)
+        # Of some groups no texel may be left.
         left = np.isin(np.arange(len(groups)), groups.group)
-        each = np.where(left[:, None, None], self.lamp_irradiance, np.float32(0))
-        chosen = self.chosen, self.segment, each
-        evidence = _evidence(surface, light, groups, chosen, outside, seed)
-        first = estimate_clipped_emitters(evidence)
-        given = surface, light, self.asked, self.frames, outside, groups, first, seed
-        return _told_by_even_light(*given)
+        return Evidence(
+            radiance=light[chosen],
+            irradiance=irradiance_of_texels(
+                self.surface, shining, self.environment, chosen, self.seed
+            ),
+            lamp_irradiance=np.where(left[:, None, None], self._of_each, np.float32(0)),
+            position=texels.position[chosen] / (_UNIT * np.sqrt(texels.area.sum())),
+            segment=segment,
+            object=texels.object_index()[chosen].astype(np.int32),
+            prior=groups.priors(),
+            shines=groups.lamp,
+        )
 
     def _beside(self, light: Float, walls: Bool) -> EstimatedRadiance:
         """Where those of the groups (K,) send what they reflect of the ``light`` (T, 3)."""
@@ -261,8 +272,9 @@ class _Weighing(NamedTuple):
     def _lights(self, light: Float, outside: Environment) -> bool:
         """Whether that alone is more than next to nothing of what the texels chosen reflect."""
         shining = Shining.of(self.surface, light, outside)
-        received = irradiance_of_texels(self.surface, shining, outside, self.chosen, self.seed)
-        reflected = np.pi * self.lit[self.chosen].mean()
+        chosen, _ = self._chosen
+        received = irradiance_of_texels(self.surface, shining, outside, chosen, self.seed)
+        reflected = np.pi * self.lit[chosen].mean()
         return bool(received.mean() > _LEAST_OF_LIGHT * reflected)
 
 
@@ -387,40 +399,3 @@ def _chosen(texels: Texels, groups: ClippedGroups, measured: Bool, seed: int) ->
     each = int(np.clip(_TEXELS // max(len(numbers), 1), _LEAST_OF_SEGMENT, _PER_SEGMENT))
     kept = np.sort(first_of_segments(rank, segment, numbers, each))
     return usable[kept], segment[kept]
-
-
-def _of_each(surface: TexturedScene, groups: ClippedGroups, chosen: Long, seed: int) -> Float:
-    """(K, N, 3) W/m^2: what each of the groups brings to the texels ``chosen``, at its bound."""
-    lamps = np.zeros((len(groups), len(chosen), 3), np.float32)
-    for k in np.unique(groups.group[groups.group >= 0]) if len(chosen) else ():
-        alone = np.where((groups.group == k)[:, None], groups.bound[k], np.float32(0))
-        light = Shining.of(surface, np.repeat(alone, 3, axis=1).astype(np.float32))
-        lamps[k] = irradiance_of_texels(
-            surface, light, black_environment(), chosen, seed + int(k) + 1
-        )
-    return lamps
-
-
-def _evidence(
-    surface: TexturedScene,
-    lit: Float,
-    groups: ClippedGroups,
-    told_by: tuple[Long, Int, Float],
-    environment: Environment,
-    seed: int,
-) -> Evidence:
-    """told_by: texels, their segments, and what each of the groups brings them."""
-    texels, (chosen, segment, lamps) = surface.texels, told_by
-    rest = np.where(groups.group[:, None] >= 0, np.float32(0), lit)
-    return Evidence(
-        radiance=lit[chosen],
-        irradiance=irradiance_of_texels(
-            surface, Shining.of(surface, rest, environment), environment, chosen, seed
-        ),
-        lamp_irradiance=lamps,
-        position=texels.position[chosen] / (_UNIT * np.sqrt(texels.area.sum())),
-        segment=segment,
-        object=texels.object_index()[chosen].astype(np.int32),
-        prior=groups.priors(),
-        shines=groups.lamp,
-    )
