@@ -21,6 +21,7 @@ from usdbrdf.material.fit_objects import (
     Lighting,
     ObjectFit,
     fitted_by_likelier_lobe,
+    have_lobe_of_paper,
     judged,
 )
 from usdbrdf.material.fit_views import SampledObject
@@ -227,7 +228,7 @@ EVIDENCE = {PAPER: 0.7, DIELECTRIC: 0.6, BECKMANN: 0.65}
 
 
 class _Run(TaskRun):
-    """One object that shows a lobe, and one with too few samples."""
+    """Two objects that show a lobe, and one between them with too few samples."""
 
     def __init__(self, *clearer: float) -> None:
         self._workers, self._for_workers = HERE, Path()
@@ -236,7 +237,7 @@ class _Run(TaskRun):
     def checkpoint_if(self, name: str, index: int | None = None) -> dict[str, np.ndarray] | None:
         if "look" not in name:
             return None
-        if not name.endswith("0"):
+        if name.endswith("1"):
             return FirstLook({}, 40).arrays()
         shows = {kind: _lobe(evidence) for kind, evidence in EVIDENCE.items()}
         return FirstLook(shows, 40, *self.clearer).arrays()
@@ -264,12 +265,12 @@ def test_the_scene_has_the_lobe_that_explains_its_views(
     monkeypatch.setattr(fit_objects, "with_what_shows_through", lambda *args: args[-1])
     names = ("rays", "radiance", "lights", "emission", "environment")
     lit = LitScene(
-        scene=SimpleNamespace(objects=range(2)),  # type: ignore[arg-type]
-        texels=SimpleNamespace(object_index=lambda: np.array([0, 1]), resolution=np.ones((2, 2))),  # type: ignore[arg-type]
+        scene=SimpleNamespace(objects=range(3)),  # type: ignore[arg-type]
+        texels=SimpleNamespace(object_index=lambda: np.arange(3), resolution=np.ones((3, 2))),  # type: ignore[arg-type]
         **dict.fromkeys(names),  # type: ignore[arg-type]
     )
-    shown = SimpleNamespace(texel=np.array([1, 0, 0]))
-    survey = SimpleNamespace(target=np.array([3, -1]), shown=np.ones(2), observations=shown)
+    shown = SimpleNamespace(texel=np.array([1, 0, 0, 2]))
+    survey = SimpleNamespace(target=np.array([3, -1, -1]), shown=np.ones(3), observations=shown)
     lightings, run = [Lighting(lit, survey)], _Run(clearer, of_beckmann)  # type: ignore[arg-type]
 
     def fitted(options: FitOptions) -> tuple[int, list[ObjectFit]]:
@@ -278,12 +279,24 @@ def test_the_scene_has_the_lobe_that_explains_its_views(
     lobe, found = fitted(FitOptions())
     assert lobe == chosen
     assert found[0].evidence == EVIDENCE[of_object]
-    assert [one.beckmann for one in found] == [of_object == BECKMANN, 0]
+    assert [one.beckmann for one in found] == [of_object == BECKMANN, 0, of_object == BECKMANN]
     assert found[0][:2] == (0.1, 0.5)
     assert found[0][7:10] == (0.12, 0.45, 0.6)
     assert (found[0].target, found[0].num_samples) == (3, 40)
     assert np.isnan(found[1].phi)
     assert fitted(FitOptions(lobe="paper"))[0] == PAPER
+
+
+@pytest.mark.parametrize(("ratios", "paper"), [
+    ([0.2, 0.15, 0.1, -0.05], True),
+    ([36.0], False),  # noise, or one odd thing
+    ([36.0, -0.1, -0.1, -0.1], False),
+    ([36.0, 0.1, 0.1, -0.1], True),
+    ([-36.0, 0.3, 0.3, 0.3], True),
+    ([], False),
+])  # fmt: skip
+def test_no_object_alone_tells_which_lobe_a_scene_has(ratios: list[float], paper: bool):
+    assert have_lobe_of_paper([None, *(FirstLook({}, 200, one) for one in ratios)]) is paper
 
 
 def test_the_other_lobe_is_tried_only_where_one_shows(monkeypatch: pytest.MonkeyPatch):

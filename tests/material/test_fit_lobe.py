@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from usdbrdf.material.fit_lobe import Candidate, Linear, fit_lobe
+from usdbrdf.material.fit_lobe import Candidate, Linear, fit_lobe, log_of_ratio
 from usdbrdf.material.verdict import NOTHING_KNOWN, SOME_EVIDENCE, LobeEstimate, averaged
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 
@@ -211,6 +211,15 @@ def test_whichever_kind_of_lobe_comes_first_the_true_one_explains_more():
     assert (sums[0] > 0.1).all()
     assert (sums[1] < -0.1).all()
     np.testing.assert_allclose(sums[:, 0], sums[:, 1], rtol=0.5)
+
+
+def test_a_cost_that_noise_makes_negative_tells_no_lobe_from_another():
+    def terms(least: float) -> np.ndarray:  # of a psi of .5, where the cost is so much
+        return np.array([[least + 1.0, 2.0, 4.0]])
+
+    assert log_of_ratio([terms(1.0), terms(3.0)], [terms(2.0)]) == pytest.approx(-math.log(2))
+    assert log_of_ratio([terms(1.0)], [terms(-0.1)]) == 0
+    assert log_of_ratio([terms(-0.1)], [terms(1.0), terms(2.0)]) == 0
 
 
 def _scatter_and_foretold(

@@ -254,10 +254,12 @@ def _least(terms: Double) -> tuple[float, int, float]:
     return float(cost[best]), best, float(psi[best])
 
 
-def _log_cost(coarse: Iterable[Double]) -> float:
-    """ln of the least cost over footprints and roughnesses of level 1, of the costs' terms: kinds
-    of lobe that share a model, at the same variances, compare."""
-    return math.log(max(min(_least(terms)[0] for terms in coarse), 1e-30))
+def log_of_ratio(coarse: Iterable[Double], others: Iterable[Double]) -> float:
+    """ln of the least cost over footprints and roughnesses of level 1 over that of another kind of
+    lobe that shares the model, from the costs' terms at the same variances; 0, as if the two
+    explained the same, where the rays' noise makes either cost negative."""
+    one, other = (min(_least(terms)[0] for terms in kind) for kind in (coarse, others))
+    return math.log(one / other) if min(one, other) > 0 else 0.0
 
 
 class FittedKind(NamedTuple):
@@ -293,8 +295,7 @@ def fit_lobe(
     fits = [_Fit(candidate, model, samples.radiance) for candidate in candidates]
 
     def log_ratio(coarse: Iterable[Double]) -> float:
-        others = (fit.coarse() for fit in before.fits) if before else ()
-        return _log_cost(coarse) - _log_cost(others) if before else 0.0
+        return log_of_ratio(coarse, (fit.coarse() for fit in before.fits)) if before else 0.0
 
     with_old = log_ratio(fit.coarse() for fit in fits)
     for _ in range(_MORE if before else _UPDATES):

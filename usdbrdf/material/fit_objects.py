@@ -252,18 +252,25 @@ def fitted_by_likelier_lobe(
         kinds = [kind for kind in (PAPER, DIELECTRIC) if options.lobe in (_NAMES[kind], "auto")]
         kinds += [BECKMANN] if DIELECTRIC in kinds else []
         looks = list(first_looks(run, lightings, reader, kinds, options))
-    clearer = sum(
-        look.log_ratio + look.ratio_of_beckmann * look.has_facets_after_beckmann
-        for look in looks
-        if look
-    )
-    paper = kinds == [PAPER] or (PAPER in kinds and clearer > _PAPER_CLEARER)
+    paper = kinds == [PAPER] or (PAPER in kinds and have_lobe_of_paper(looks))
     lobe = PAPER if paper else DIELECTRIC
 
     given = _Scene(tuple(lightings), reader, options, (lobe,))
     pieces = [(i, looks[i], asked.get(i, "")) for i in range(len(sizes))]
     found = _of_each_object(run, "object", sizes, _fit, given, pieces, label="fit")
     return lobe, [ObjectFit.from_arrays(one).rounded() for one in found]
+
+
+def have_lobe_of_paper(looks: Sequence[FirstLook | None]) -> bool:
+    """Whether the paper's lobe explains the views of all objects clearly better than that of
+    renderers. No object tells alone: of a few samples in noisy light one lobe may by chance seem
+    to explain all."""
+    each = [
+        look.log_ratio + look.ratio_of_beckmann * look.has_facets_after_beckmann
+        for look in looks
+        if look
+    ]
+    return bool(np.clip(each, -_PAPER_CLEARER, _PAPER_CLEARER).sum() > _PAPER_CLEARER)
 
 
 class _Scene(NamedTuple):
