@@ -120,9 +120,9 @@ def test_to_see_everything_twice_tells_of_the_same_metal():
 
 def test_the_roughest_metal_is_told_by_nobody_but_a_person():
     rough = (0.01 + F0) * _incident(1)
-    assert _found(rough, 1.0, phi=0.46) is not None
-    assert _found(rough, 1.0, phi=0.6) is None
-    assert _found(rough, 1.0, phi=0.6, certain=True) is not None
+    assert _found(rough, 1.0, phi=0.67) is not None
+    assert _found(rough, 1.0, phi=0.8) is None
+    assert _found(rough, 1.0, phi=0.8, certain=True) is not None
 
 
 @pytest.mark.parametrize(

@@ -15,13 +15,14 @@ from usdbrdf.material.seen_through import (
     radiance_behind,
     seen_through,
 )
-from usdbrdf.material.verdict import MOST_OF_MEASURED, LobeEstimate
+from usdbrdf.material.verdict import MOST_OF_MEASURED
 from usdbrdf.material.view_model import ViewSamples
+from usdbrdf.transport.brdf import F0_OF_PSI
 from usdbrdf.transport.environment import Environment
 from usdbrdf.transport.lit_scene import LitScene, points_of_texels
 
 PANE, VIEWS = 6, 12
-LOBE = LobeEstimate(0.2, 0.3, 0.01, 0.01, 0.0, 1.0, 0.9)
+PHI, PSI, PSI_OF_METAL = 0.2, 0.3, 9.0
 
 
 def _slab(depth: float) -> Part:
@@ -102,7 +103,9 @@ def test_past_panes_it_shows_the_surroundings(lit: LitScene):
     assert (radiance_behind(lit, points_of_texels(lit.texels, texel, eye), PANE) == 7).all()
 
 
-def _through(lit: LitScene, share: float, seed: int) -> Through:
+def _through(
+    lit: LitScene, share: float, seed: int, psi: float = PSI, most_psi: float = 1.0
+) -> Through:
     """Of samples of a patterned, shining surface that lets a share of what is behind through."""
     random, world = np.random.default_rng(seed), _world()
     texel, frame, eye = _views(world, PANE)
@@ -111,7 +114,7 @@ def _through(lit: LitScene, share: float, seed: int) -> Through:
     mirrored = points.to_camera * (-1, 1, -1)
     lamp = np.array([0.3, 0.8, 0.52])
     slope = np.exp(-((mirrored + lamp) ** 2).sum(axis=1) / 0.1)[:, None] * np.ones(3)
-    seen = _pattern(world.texels.position[texel]) + 0.3 * slope + share * behind
+    seen = _pattern(world.texels.position[texel]) + psi * slope + share * behind
     seen *= 1 + 0.02 * random.standard_normal(VIEWS)[frame, None]
     seen *= 1 + 0.02 * random.standard_normal(seen.shape)
     samples = ViewSamples(
@@ -124,7 +127,7 @@ def _through(lit: LitScene, share: float, seed: int) -> Through:
     )
     base = np.zeros((len(texel), 3, 1), np.float32)
     slope = slope.astype(np.float32)[..., None]
-    return seen_through(samples, behind, lambda _: (base, slope), LOBE)
+    return seen_through(samples, behind, lambda _: (base, slope), PHI, psi, most_psi)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -134,6 +137,14 @@ def test_the_share_that_shows_through_is_found(lit: LitScene, share: float, seed
     assert abs(found.share - share) < max(3 * found.error, 0.01)
     assert found.error < 0.05
     assert (found.at_least > MOST_OF_MEASURED) == (share > MOST_OF_MEASURED)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_what_a_metal_mirrors_is_told_from_what_is_behind(lit: LitScene, share: float):
+    found = _through(lit, share, 0, PSI_OF_METAL, 1 / F0_OF_PSI)
+    assert abs(found.share - share) < max(3 * found.error, 0.01)
+    # As a dielectric that shines no more than one does, its mirror image would be an error.
+    assert found.error < 0.5 * _through(lit, share, 0, PSI_OF_METAL).error
 
 
 def test_behind_what_looks_alike_from_everywhere_nothing_tells(lit: LitScene):
@@ -149,7 +160,7 @@ def test_behind_what_looks_alike_from_everywhere_nothing_tells(lit: LitScene):
     )
     behind = random.random((40, 3)).astype(np.float32)[texel]
     none = np.zeros((len(texel), 3, 1), np.float32)
-    found = seen_through(samples, behind, lambda _: (none, none), LOBE)
+    found = seen_through(samples, behind, lambda _: (none, none), PHI, PSI)
     assert found.at_least == 0
 
 
@@ -171,7 +182,7 @@ class Plain:
 @pytest.mark.parametrize(
     ("psi", "share"), [(0.3, 0.4), (0.7, 0.1), (0.2, 1.4), (0.6, -0.5), (1.3, 0.5), (-0.4, 0.8)]
 )
-def test_both_factors_are_those_of_least_squares_between_0_and_1(psi, share):
+def test_both_factors_are_those_of_least_squares(psi, share):
     random = np.random.default_rng(3)
     lobe, behind = random.uniform(0, 1, (2, 40, 3))
     behind += lobe  # so that neither is told without the other
@@ -183,7 +194,7 @@ def test_both_factors_are_those_of_least_squares_between_0_and_1(psi, share):
     assert through.error == pytest.approx(np.sqrt(np.linalg.inv(columns.T @ columns)[1, 1]))
     # Once one is held the other is what is best beside it.
     left = rest - through.share * behind
-    assert found == pytest.approx(np.clip((left * lobe).sum() / (lobe**2).sum(), 0, 1))
+    assert found == pytest.approx(max((left * lobe).sum() / (lobe**2).sum(), 0))
 
 
 def test_what_looks_as_the_lobe_does_or_is_not_there_tells_nothing():

@@ -349,7 +349,9 @@ def with_what_shows_through(
     shows through a thing for sure contradicts its being a surface."""
     if verdict_on_views(found, True).status != "measured":
         return found
-    through = _shown_through(lobe, sampled(), index, seed, found)
+    held = sampled()
+    basis = partial(held.basis(0, 3 * (_SEED_OF_THROUGH + seed)), lobe)
+    through = seen_through(held.samples, held.behind(index), basis, found.phi, found.psi).at_least
     return found._replace(contradiction=max(found.contradiction, through))
 
 
@@ -364,17 +366,20 @@ def metal_if_opaque(
     """The ``metal`` that the object ``index`` would be; None where what is behind it shows through
     it, as it does through a pane: then the dielectric that was ``found`` is contradicted by that.
     Before and behind a pane a room may look alike."""
-    through = _shown_through(lobe, sampled(), index, seed, found._replace(phi=metal.phi))
+    held, kind = sampled(), PAPER if lobe == PAPER else CONDUCTOR
+    of_kind = held.basis(0, 3 * (_SEED_OF_THROUGH + seed))
+    strongest = max(metal.f0)
+    tint = (np.array(metal.f0, np.float32) / np.float32(strongest))[:, None]
+
+    def basis(phis: Sequence[float]) -> tuple[Float, Float]:
+        base, slope = of_kind(kind, phis)
+        return base, tint * slope
+
+    given = metal.phi, strongest / F0_OF_PSI, 1 / F0_OF_PSI
+    through = seen_through(held.samples, held.behind(index), basis, *given).at_least
     if through <= MOST_CONTRADICTED:
         return found, metal
     return found._replace(contradiction=max(found.contradiction, through)), None
-
-
-def _shown_through(
-    lobe: int, held: SampledObject, index: int, seed: int, found: LobeEstimate
-) -> float:
-    basis = partial(held.basis(0, 3 * (_SEED_OF_THROUGH + seed)), lobe)
-    return seen_through(held.samples, held.behind(index), basis, found).at_least
 
 
 def error_by_doubt(sampled: SampledObject, kind: int, phi: float, psi: float, seed: int) -> float:

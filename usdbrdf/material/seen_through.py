@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from usdbrdf.material.verdict import LobeEstimate
 from usdbrdf.material.view_model import ViewModel, ViewSamples
 from usdbrdf.model.arrays import Float
 from usdbrdf.transport.environment import radiance_from
@@ -53,28 +52,32 @@ def seen_through(
     samples: ViewSamples,
     behind: Float,
     basis: Callable[[Sequence[float]], tuple[Float, Float]],
-    found: LobeEstimate,
+    phi: float,
+    psi: float,
+    most_psi: float = 1.0,
 ) -> Through:
     """How much of ``behind`` (P, 3) the samples show beside diffuse light, free for each texel, and
-    a lobe with the roughness that was ``found``: both factors by least squares, with the errors
-    that samples of a frame share.
+    a lobe of roughness ``phi``: both factors by least squares, with the errors that samples of a
+    frame share.
 
-    basis: roughnesses (K,) -> (base, slope) of I_nd = base + psi slope, (P, 3, K) each.
+    basis: roughnesses (K,) -> (base, slope) of I_nd = base + psi slope, (P, 3, K) each; psi: about
+    what it is, and ``most_psi`` what it may be.
     """
-    base, slope = (one[..., 0] for one in basis([found.phi]))
+    base, slope = (one[..., 0] for one in basis([phi]))
     rest = samples.radiance - base
     model = ViewModel(samples)
-    psi, through = found.psi, NOTHING
+    through = NOTHING
     for _ in range(_UPDATES):
         model.update(base + np.float32(psi) * slope + np.float32(through.share) * behind)
         psi, through = _least_squares(model, rest, slope, behind)
+        psi = min(psi, most_psi)
     return through
 
 
 def _least_squares(
     model: ViewModel, rest: Float, slope: Float, behind: Float
 ) -> tuple[float, Through]:
-    """psi and how much shows through, each from 0 to 1."""
+    """psi, which is not negative, and how much shows through, from 0 to 1."""
     left, lobe, far = model.reduced(np.stack([rest, slope, behind], axis=2)).parts(3)
     of_lobe, of_far = (float(model.product(one, one)[0]) for one in (lobe, far))
     both = float(model.product(lobe, far)[0])
@@ -86,4 +89,4 @@ def _least_squares(
         share = (far_left - both * lobe_left * per_lobe) / alone
         through = Through(min(max(share, 0.0), 1.0), 1 / math.sqrt(alone))
     psi = (lobe_left - through.share * both) * per_lobe
-    return min(max(psi, 0.0), 1.0), through
+    return max(psi, 0.0), through
