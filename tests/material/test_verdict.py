@@ -38,11 +38,22 @@ def _lobe(**numbers: float) -> LobeEstimate:
     return sharp._replace(**numbers)
 
 
+# Of a phi of 0.1, by what the model of lobes lacks.
+LACKING = (0.05 * 0.1, 0.005)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.2])
+def test_many_samples_do_not_make_phi_surer_than_the_model_of_lobes_is(phi: float):
+    """Of a floor phi was known to 0.001 by its samples, and off by 0.011."""
+    found = verdict_on_views(_lobe(phi=phi, phi_error=1e-4), True)
+    assert found.phi_error == pytest.approx(math.hypot(0.05 * phi, 0.005), rel=1e-3)
+
+
 @pytest.mark.parametrize("evidence", [SOME_EVIDENCE, 1.0])
 def test_a_measurement_is_published_as_found(evidence: float):
     found = verdict_on_views(_lobe(evidence=evidence), True)
     assert (found.phi, found.psi, found.psi_error) == (0.1, 0.8, 0.05)
-    assert found.phi_error == 0.02
+    assert found.phi_error == pytest.approx(math.hypot(0.02, *LACKING))
     assert (found.phi_confidence, found.psi_confidence) == ("high", "high")
     assert (found.status, found.psi_upper) == ("measured", 0.9)
 
@@ -146,7 +157,7 @@ def test_a_highlight_as_small_as_its_footprint_is_no_measurement():
     # Some of phi may be the footprint's, or all of it.
     for unresolved, confidence in ((0.03, "high"), (0.15, "low")):
         found = verdict_on_views(_lobe(unresolved=unresolved), True)
-        assert found.phi_error == pytest.approx(math.hypot(0.02, unresolved))
+        assert found.phi_error == pytest.approx(math.hypot(0.02, unresolved, *LACKING))
         # A blurred highlight holds the same light.
         assert found.psi_error == pytest.approx(
             math.hypot(0.05, 0.08 * min(unresolved / 0.1, 1)), rel=0.03

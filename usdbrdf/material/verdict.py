@@ -191,6 +191,7 @@ MOST_OF_MEASURED = calibration.number("verdict.most_contradicted_of_measured")
 MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
 MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
 _MAX_F0_ERROR = calibration.number("conductor.max_f0_error")
+_LACKING_SHARE, _LACKING = calibration.pair("verdict.lacking_in_phi")
 _PSI_SHARE = calibration.number("verdict.footprint_in_psi")
 _MAX_FLAT_PHI = calibration.number("verdict.of_frame.max_flat_phi") / math.sqrt(12)
 _MIN_EVIDENCE_OF_FRAME = calibration.number("verdict.of_frame.min_evidence")
@@ -235,7 +236,8 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     if lobe is None:
         return _not_asked(seen)
     of_psi = _PSI_SHARE * lobe.psi * min(lobe.unresolved / max(lobe.phi, 0.01), 1.0)
-    phi_error = min(math.hypot(lobe.phi_error, lobe.unresolved), NOTHING_KNOWN)
+    lacking = math.hypot(_LACKING_SHARE * lobe.phi, _LACKING)
+    phi_error = min(math.hypot(lobe.phi_error, lobe.unresolved, lacking), NOTHING_KNOWN)
     psi_error = min(math.hypot(lobe.psi_error, of_psi), NOTHING_KNOWN)
 
     # Where something changes with the view, but reflects next to nothing, it is no surface's lobe.
