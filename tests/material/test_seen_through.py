@@ -164,6 +164,39 @@ def test_behind_what_looks_alike_from_everywhere_nothing_tells(lit: LitScene):
     assert found.at_least == 0
 
 
+def _shown(behind: np.ndarray, share: float, own: float) -> Through:
+    """Of samples that show their own light, alike from everywhere, and a share of what is behind,
+    as it varies about its mean."""
+    texel = np.repeat(np.arange(40), VIEWS)
+    seen = own + share * (behind - behind.mean())
+    seen *= 1 + 0.001 * np.random.default_rng(2).standard_normal(seen.shape)
+    samples = ViewSamples(
+        texel=texel,
+        frame=np.tile(np.arange(VIEWS), 40),
+        position=np.random.default_rng(3).random((len(texel), 3)).astype(np.float32),
+        radiance=seen.astype(np.float32),
+        noise=np.full(seen.shape, 1e-4, np.float32),
+        cell=0.1,
+    )
+    none = np.zeros((len(texel), 3, 1), np.float32)
+    return seen_through(samples, behind.astype(np.float32), lambda _: (none, none), PHI, PSI)
+
+
+def test_of_darkness_much_may_show_through_that_is_next_to_nothing():
+    """The front of a cupboard was told to be glass by what is in it."""
+    behind = np.random.default_rng(4).uniform(0.01, 0.03, (40 * VIEWS, 3))
+    found = _shown(behind, 0.6, 1.0)
+    assert found.share == pytest.approx(0.6, abs=0.05)
+    assert found.behind == pytest.approx(0.02, rel=0.1)
+    assert found.at_least < 0.02
+
+
+def test_no_more_shows_through_than_there_is_light():
+    behind = np.random.default_rng(4).uniform(4.9, 5.1, (40 * VIEWS, 3))
+    assert _shown(behind, 0.6, 1.0).share == pytest.approx(0.2, rel=0.01)
+    assert _shown(behind, 0.6, 4.0).share == pytest.approx(0.6, rel=0.05)
+
+
 class Plain:
     """A model of samples that err alike: products are sums."""
 
