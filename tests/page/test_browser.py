@@ -383,6 +383,27 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     assert shown.faults == []
 
 
+def test_what_was_not_fitted_says_why_and_shows_no_numbers(opened, page_file, tmp_path):
+    data = data_of(page_file.read_text("utf-8"))
+    pane, seen_through, *_ = (row for row in data["objects"] if row["status"] != "lamp")
+    pane |= {"status": "prior", "because": "pane", "f0": None}
+    pane.pop("costs", None)
+    seen_through |= {"status": "prior", "because": "contradicted"}
+    (tmp_path / "pane.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "pane.html").as_uri())
+    row = shown.locator(f"#table tbody tr[data-prim='{pane['prim']}']")
+    assert "clear glass" in row.inner_text()
+    assert row.locator("td.number").first.inner_text() == "\u2013"
+    shown.get_by_role("button", name=pane["label"], exact=True).click()
+    detail = shown.locator("#table tbody tr.detail:visible").inner_text()
+    assert "Clear glass is not fitted." in detail
+    assert "confidence" not in detail
+    shown.get_by_label("Status").select_option("contradicted")
+    assert shown.locator("#table tbody tr:not(.detail):visible").count() == 1
+    assert "seen through" in shown.locator("#table tbody tr:not(.detail):visible").inner_text()
+    assert shown.faults == []
+
+
 def test_the_page_of_a_version_says_which_it_is(opened, page_file, room, tmp_path):
     asset = Asset.made(room.asset)
     assert data_of(page_file.read_text("utf-8"))["published"] == ""
