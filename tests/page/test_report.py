@@ -495,7 +495,7 @@ def test_a_night_is_dark_though_photographs_show_a_little_of_it(room):
 
     def sky(radiance, sun=NO_SUN):
         image = np.full((8, 16, 3), radiance, np.float32)
-        return Environment(image=image, z_up=True, sun=sun)
+        return Environment(image, True).under(sun)
 
     assert is_dark(sky(0), atlas)
     assert is_dark(sky(1e-4 * usual), atlas)

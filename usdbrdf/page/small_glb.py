@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from usdbrdf.model.arrays import Array, Int
+from usdbrdf.model.arrays import Array, Long
 
 FILTERED = (
     "usdbrdfFiltered"  # of the document's extras: number of a buffer view -> bytes of a number
 )
 _QUANTIZATION = "KHR_mesh_quantization"
 _FLOAT, _BYTE, _SHORT, _INT = 5126, 5120, 5123, 5125
-_TYPES = {_FLOAT: np.dtype("<f4"), _BYTE: np.dtype("i1"), _SHORT: np.dtype("<u2"),
+_TYPES: dict[int, np.dtype[Any]] = {_FLOAT: np.dtype("<f4"), _BYTE: np.dtype("i1"), _SHORT: np.dtype("<u2"),
           _INT: np.dtype("<u4")}  # fmt: skip
 _COUNTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _SMALLER = {"POSITION", "NORMAL", "TEXCOORD_0"}
@@ -35,7 +35,7 @@ class _Mesh(NamedTuple):
 
     primitive: dict[str, Any]
     node: dict[str, Any]
-    corners: Int  # (3 F,) rows of the others
+    corners: Long  # (3 F,) rows of the others
     position: Array
     normal: Array
     texture: Array
@@ -154,7 +154,7 @@ def _put(kept: _Kept, mesh: _Mesh, step: float) -> None:
     )
 
 
-def _in_order_of_use(rows: Int, corners: Int) -> tuple[Int, Int]:
+def _in_order_of_use(rows: Long, corners: Long) -> tuple[Long, Long]:
     """Rows that ``corners`` use, each once, and corners that are rows of these."""
     _, first, same = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     used, at, place = np.unique(same.reshape(-1)[corners], return_index=True, return_inverse=True)
