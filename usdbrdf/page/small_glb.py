@@ -21,8 +21,9 @@ FILTERED = (
 )
 _QUANTIZATION = "KHR_mesh_quantization"
 _FLOAT, _BYTE, _SHORT, _INT = 5126, 5120, 5123, 5125
-_TYPES: dict[int, np.dtype[Any]] = {_FLOAT: np.dtype("<f4"), _BYTE: np.dtype("i1"), _SHORT: np.dtype("<u2"),
-          _INT: np.dtype("<u4")}  # fmt: skip
+_TYPES: dict[int, np.dtype[Any]] = {
+    _FLOAT: np.dtype("<f4"), _BYTE: np.dtype("i1"), _SHORT: np.dtype("<u2"), _INT: np.dtype("<u4"),
+}  # fmt: skip
 _COUNTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _SMALLER = {"POSITION", "NORMAL", "TEXCOORD_0"}
 # Steps of the grid along the room, and of texture coordinates, which are multiples of the latter.
