@@ -199,12 +199,14 @@ def test_daylight_is_switched_on_and_off_and_named_for_what_it_is(opened, page_f
     assert shown.faults == []
 
 
-def test_advice_is_written_in_signs(opened, page_file, tmp_path):
+def test_advice_and_warnings_are_written_in_signs(opened, page_file, tmp_path):
     data = data_of(page_file.read_text("utf-8"))
     pose = {"where": "Stand there.", "reason": "psi +-0.29 -> +-0.22; 61 m^2 that no frame shows."}
     data["advice"] = {"poses": [pose], "current": True}
+    data["warnings"] = ["lamp: its radiance is 6.72, +-44 %."]
     (tmp_path / "advice.html").write_text(page(data), "utf-8")
     shown = opened((tmp_path / "advice.html").as_uri())
+    assert "6.72, \u00b144 %" in shown.locator("#warnings").inner_text()
     told = shown.locator("#advised li").inner_text()
     assert "psi \u00b10.29 \u2192\u00a0\u00b10.22; 61 m\u00b2" in told
 

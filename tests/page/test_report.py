@@ -24,7 +24,7 @@ from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView, measured_atlas
 from usdbrdf.model.material import turned_up
 from usdbrdf.page import objects, views
 from usdbrdf.page.capture import findings, warnings_of
-from usdbrdf.page.daylight import _around, daylight, is_dark
+from usdbrdf.page.daylight import _around, daylight
 from usdbrdf.page.objects import undetermined_because, why
 from usdbrdf.page.pictures import (
     _BACKGROUND,
@@ -309,7 +309,7 @@ def test_the_counts_of_all_objects_are_told_and_hundreds_of_lamps_in_one_sentenc
     assert unseen.startswith("No photograph measures the lamps bulb_0, bulb_1,")
     assert unseen.endswith(" and 193 more: their radiances are estimates.")
     parts = findings({"texture": {}, "shade": {}}, ["lamp"], True, (), ["table", "shelf"])
-    assert parts[1:] == ["1 is a lamp.", "A part of table, shelf shines, too."]
+    assert parts[1:] == ["1 is a lamp.", "Parts of table, shelf shine, too."]
     (one,) = (line for line in findings({"texture": {}, "shade": {}}, ["failed"], True)[1:])
     assert one == "The fit of 1 failed: its photographs do not determine the numbers."
 
@@ -331,7 +331,7 @@ def test_nothing_that_a_photograph_shows_is_said_to_be_in_none():
     assert told[1:] == [
         "Photographs hardly show 2: nothing on them was measured, and everything but a colour is a "
         "guess.",
-        "No photograph shows 1 of them.",
+        "No photograph shows 1 of the objects.",
     ]
     assert why(fit_of(), "unseen", None, in_sight=False).startswith("No photograph shows it: ")
     assert why(fit_of(), "unseen", None, in_sight=True).startswith("Photographs hardly show it")
@@ -342,12 +342,12 @@ def test_nothing_that_a_photograph_shows_is_said_to_be_in_none():
     texture = {"measured_fraction": 0.8, "clipped_fraction": 0.01, "glimpsed_fraction": 0.02}
     told = findings({"texture": texture, "shade": {}}, [], True)
     assert told[1] == (
-        "Photographs measured 80.0% of the surface; 1.00% clipped in all of them; 2.00% is too "
-        "thin for that and was glimpsed; the rest is filled in from around it."
+        "Photographs measured 80.0% of the surface; 1.00% clipped in all that show it; 2.00% is "
+        "too thin for that and was glimpsed; the rest is filled in from around it."
     )
     told = findings({"texture": {"measured_fraction": 0.8}, "shade": {}}, [], True)
     assert told[1] == (
-        "Photographs measured 80.0% of the surface; 0.00% clipped in all of them; the rest is "
+        "Photographs measured 80.0% of the surface; 0.00% clipped in all that show it; the rest is "
         "filled in from around it."
     )
 
@@ -461,55 +461,3 @@ def test_things_that_shine_in_part_are_no_lamps_by_name(room):
     atlas.emission[own.start + (own.stop - own.start) // 8 : own.stop] = 0
     atlas.emissive[own.start + (own.stop - own.start) // 8 : own.stop] = False
     assert f"part of {name}" in {lamp["label"] for lamp in lamps(atlas, "Z")}
-
-
-def test_the_findings_say_what_is_known_of_the_light_from_outside():
-    def told(dark=False, **outside):
-        shade = {"escaped_fraction": 0.25, **outside}
-        return findings({"texture": {}, "shade": shade}, ["prior"], True, dark_outside=dark)[-1]
-
-    begins = "25.0% of the directions in which surfaces look leave the scan."
-    assert told() == f"{begins} What is out there counts as dark."
-    found = {
-        "source": "estimated",
-        "sky_error": 0.52,
-        "sun_error": 0.11,
-        "sun_direction": [0, 0, 1],
-    }
-    estimated = "The light from there was estimated: sky to \u00b1 52%, sun to \u00b1 11%."
-    assert told(outside=found) == f"{begins} {estimated}"
-    seen = {"source": "estimated"}
-    assert (
-        told(outside=seen) == f"{begins} The light from there is known: sky as photographs show it."
-    )
-    assert told(dark=True, outside=seen) == (
-        f"{begins} It is dark out there, as by night: next to no light comes in."
-    )
-    given = {"source": "given", "sky_error": 0.0}
-    assert told(outside=given) == f"{begins} A file told the light from there: sky."
-
-
-def test_a_night_is_dark_though_photographs_show_a_little_of_it(room):
-    _, atlas = measured_atlas(room.asset)
-    usual = float(np.median(atlas.irradiance))
-
-    def sky(radiance, sun=NO_SUN):
-        image = np.full((8, 16, 3), radiance, np.float32)
-        return Environment(image, True).under(sun)
-
-    assert is_dark(sky(0), atlas)
-    assert is_dark(sky(1e-4 * usual), atlas)
-    assert not is_dark(sky(0.1 * usual), atlas)
-    sun = Sun(np.array([0.0, 0.0, 1.0]), np.ones(3), 0.00465)
-    assert not is_dark(sky(0, sun), atlas)
-
-
-def test_metals_are_named_and_the_table_says_of_each_object_why_it_is_not_known(room, page_file):
-    steps = {"texture": {}, "shade": {}}
-    (said,) = findings(steps, ["measured"], True, metals=["tap"])[1:]
-    assert said == "1 is a metal: tap."
-    (said,) = findings(steps, ["measured"] * 2, True, metals=["tap", "pan"])[1:]
-    assert said == "2 are metals: tap, pan."
-    rows = data_of(page_file.read_text("utf-8"))["objects"]
-    assert {row["because"] for row in rows} >= {"lamp"}
-    assert all(row["because"] == row["status"] for row in rows if row["status"] == "measured")

@@ -190,16 +190,18 @@ def findings(
             "was measured, and everything but a colour is a guess."
         )
     if unseen := count.get("unseen"):
-        told.append(f"No photograph shows {unseen if unseen < total else 'any'} of them.")
+        told.append(f"No photograph shows {unseen if unseen < total else 'any'} of the objects.")
     if lamps := count.get("lamp"):
         told.append(f"{lamps} {'is a lamp' if lamps == 1 else 'are lamps'}.")
     if shining_parts:
-        told.append(f"A part of {_few(shining_parts)} shines, too.")
+        one = len(shining_parts) == 1
+        parts = f"{'A part' if one else 'Parts'} of {_few(shining_parts)}"
+        told.append(f"{parts} {'shines' if one else 'shine'}, too.")
     texture, shade = found["texture"], found["shade"]
     if "measured_fraction" in texture:
         told.append(
             f"Photographs measured {texture['measured_fraction']:.1%} of the surface; "
-            f"{texture.get('clipped_fraction', 0):.2%} clipped in all of them; "
+            f"{texture.get('clipped_fraction', 0):.2%} clipped in all that show it; "
             f"{_glimpsed(texture)}the rest is filled in from around it."
         )
     if "standard_error" in shade:

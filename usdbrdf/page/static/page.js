@@ -43,7 +43,7 @@
     $('lead').textContent = `${facts.frames} photographs, ${data.objects.length} objects, ${measured} measured`;
     $('findings').append(...data.findings.map((sentence) => el('li', {}, sentence)));
     const warned = (data.warnings || []).map((sentence) =>
-      el('p', { class: 'warning' }, el('strong', {}, 'Warning: '), sentence));
+      el('p', { class: 'warning' }, el('strong', {}, 'Warning: '), signs(sentence)));
     const first = warned.length > MOST_WARNINGS + 1 ? MOST_WARNINGS : warned.length;
     $('warnings').append(...warned.slice(0, first));
     if (first < warned.length) {
