@@ -24,6 +24,25 @@ async function unpacked(text) {
   return new Response(stream).arrayBuffer();
 }
 
+/* Takes back what usdbrdf/page/small_glb.py does to arrays of a file, in place: differences of each
+   column, their lowest bytes first, become numbers. */
+function unfiltered(file) {
+  const length = new DataView(file).getUint32(12, true);
+  const document = JSON.parse(new TextDecoder().decode(new Uint8Array(file, 20, length)));
+  for (const [index, size] of Object.entries(document.extras?.usdbrdfFiltered || {})) {
+    const { byteOffset = 0, byteLength, byteStride = size } = document.bufferViews[index];
+    const bytes = new Uint8Array(file, 28 + length + byteOffset, byteLength), steps = bytes.slice();
+    const rows = byteLength / byteStride;
+    for (let column = 0; column < byteStride; column += size) {
+      for (let row = 0, value = 0; row < rows; row += 1) {
+        for (let k = 0; k < size; k += 1) value = (value + (steps[(column + k) * rows + row] << (8 * k))) | 0;
+        for (let k = 0; k < size; k += 1) bytes[row * byteStride + column + k] = value >> (8 * k);
+      }
+    }
+  }
+  return file;
+}
+
 /* room: data of the page; colours: look -> prim -> [r, g, b] of one colour per object; pick(prim)
    is called with an object, or null. Resolves to what the page's controls call. */
 export async function start(canvas, room, colours, pick) {
@@ -32,7 +51,7 @@ export async function start(canvas, room, colours, pick) {
   renderer.toneMapping = LinearToneMapping;
   const scene = new Scene();
   const night = scene.background = new Color(NIGHT);
-  const { scene: model } = await new GLTFLoader().parseAsync(await unpacked(room.glb), '');
+  const { scene: model } = await new GLTFLoader().parseAsync(unfiltered(await unpacked(room.glb)), '');
   scene.add(model);
   const meshes = [], others = [];
   model.traverse((node) => {

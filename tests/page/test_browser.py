@@ -199,12 +199,14 @@ def test_daylight_is_switched_on_and_off_and_named_for_what_it_is(opened, page_f
     assert shown.faults == []
 
 
-def test_advice_is_written_in_signs(opened, page_file, tmp_path):
+def test_advice_and_warnings_are_written_in_signs(opened, page_file, tmp_path):
     data = data_of(page_file.read_text("utf-8"))
     pose = {"where": "Stand there.", "reason": "psi +-0.29 -> +-0.22; 61 m^2 that no frame shows."}
     data["advice"] = {"poses": [pose], "current": True}
+    data["warnings"] = ["lamp: its radiance is 6.72, +-44 %."]
     (tmp_path / "advice.html").write_text(page(data), "utf-8")
     shown = opened((tmp_path / "advice.html").as_uri())
+    assert "6.72, \u00b144 %" in shown.locator("#warnings").inner_text()
     told = shown.locator("#advised li").inner_text()
     assert "psi \u00b10.29 \u2192\u00a0\u00b10.22; 61 m\u00b2" in told
 
@@ -380,6 +382,27 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     assert shown.locator("#warnings .warning:visible").count() == 8
     shown.get_by_text("4 more warnings").click()
     assert shown.locator("#warnings .warning:visible").count() == 12
+    assert shown.faults == []
+
+
+def test_what_was_not_fitted_says_why_and_shows_no_numbers(opened, page_file, tmp_path):
+    data = data_of(page_file.read_text("utf-8"))
+    pane, seen_through, *_ = (row for row in data["objects"] if row["status"] != "lamp")
+    pane |= {"status": "prior", "because": "pane", "f0": None}
+    pane.pop("costs", None)
+    seen_through |= {"status": "prior", "because": "contradicted"}
+    (tmp_path / "pane.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "pane.html").as_uri())
+    row = shown.locator(f"#table tbody tr[data-prim='{pane['prim']}']")
+    assert "clear glass" in row.inner_text()
+    assert row.locator("td.number").first.inner_text() == "\u2013"
+    shown.get_by_role("button", name=pane["label"], exact=True).click()
+    detail = shown.locator("#table tbody tr.detail:visible").inner_text()
+    assert "Clear glass is not fitted." in detail
+    assert "confidence" not in detail
+    shown.get_by_label("Status").select_option("contradicted")
+    assert shown.locator("#table tbody tr:not(.detail):visible").count() == 1
+    assert "seen through" in shown.locator("#table tbody tr:not(.detail):visible").inner_text()
     assert shown.faults == []
 
 

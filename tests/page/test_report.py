@@ -309,7 +309,7 @@ def test_the_counts_of_all_objects_are_told_and_hundreds_of_lamps_in_one_sentenc
     assert unseen.startswith("No photograph measures the lamps bulb_0, bulb_1,")
     assert unseen.endswith(" and 193 more: their radiances are estimates.")
     parts = findings({"texture": {}, "shade": {}}, ["lamp"], True, (), ["table", "shelf"])
-    assert parts[1:] == ["1 is a lamp.", "A part of table, shelf shines, too."]
+    assert parts[1:] == ["1 is a lamp.", "Parts of table, shelf shine, too."]
     (one,) = (line for line in findings({"texture": {}, "shade": {}}, ["failed"], True)[1:])
     assert one == "The fit of 1 failed: its photographs do not determine the numbers."
 
@@ -331,7 +331,7 @@ def test_nothing_that_a_photograph_shows_is_said_to_be_in_none():
     assert told[1:] == [
         "Photographs hardly show 2: nothing on them was measured, and everything but a colour is a "
         "guess.",
-        "No photograph shows 1 of them.",
+        "No photograph shows 1 of the objects.",
     ]
     assert why(fit_of(), "unseen", None, in_sight=False).startswith("No photograph shows it: ")
     assert why(fit_of(), "unseen", None, in_sight=True).startswith("Photographs hardly show it")
@@ -342,12 +342,12 @@ def test_nothing_that_a_photograph_shows_is_said_to_be_in_none():
     texture = {"measured_fraction": 0.8, "clipped_fraction": 0.01, "glimpsed_fraction": 0.02}
     told = findings({"texture": texture, "shade": {}}, [], True)
     assert told[1] == (
-        "Photographs measured 80.0% of the surface; 1.00% clipped in all of them; 2.00% is too "
-        "thin for that and was glimpsed; the rest is filled in from around it."
+        "Photographs measured 80.0% of the surface; 1.00% clipped in all that show it; 2.00% is "
+        "too thin for that and was glimpsed; the rest is filled in from around it."
     )
     told = findings({"texture": {"measured_fraction": 0.8}, "shade": {}}, [], True)
     assert told[1] == (
-        "Photographs measured 80.0% of the surface; 0.00% clipped in all of them; the rest is "
+        "Photographs measured 80.0% of the surface; 0.00% clipped in all that show it; the rest is "
         "filled in from around it."
     )
 
@@ -461,22 +461,3 @@ def test_things_that_shine_in_part_are_no_lamps_by_name(room):
     atlas.emission[own.start + (own.stop - own.start) // 8 : own.stop] = 0
     atlas.emissive[own.start + (own.stop - own.start) // 8 : own.stop] = False
     assert f"part of {name}" in {lamp["label"] for lamp in lamps(atlas, "Z")}
-
-
-def test_the_findings_say_what_is_known_of_the_light_from_outside():
-    def told(**outside):
-        shade = {"escaped_fraction": 0.25, **outside}
-        return findings({"texture": {}, "shade": shade}, ["prior"], True)[-1]
-
-    begins = "25.0% of the directions in which surfaces look leave the scan."
-    assert told() == f"{begins} What is out there counts as dark."
-    found = {
-        "source": "estimated",
-        "sky_error": 0.52,
-        "sun_error": 0.11,
-        "sun_direction": [0, 0, 1],
-    }
-    estimated = "The light from there was estimated: sky to \u00b1 52%, sun to \u00b1 11%."
-    assert told(outside=found) == f"{begins} {estimated}"
-    given = {"source": "given", "sky_error": 0.0}
-    assert told(outside=given) == f"{begins} A file told the light from there: sky."

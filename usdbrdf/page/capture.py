@@ -140,18 +140,25 @@ def findings(
     radiometric: bool,
     never_observed: Collection[str] = (),
     shining_parts: Sequence[str] = (),
+    *,
+    metals: Sequence[str] = (),
+    dark_outside: bool = False,
 ) -> list[str]:
     """What was found, what not and why, in sentences.
 
     words           of each object, see ``status_of`` and ``undetermined_because``
     never_observed  identifiers of objects of which no frame tells anything
     shining_parts   those of objects that are no lamps but of a small part
+    metals          those of objects that are metals, measured well or not
+    dark_outside    whether next to no light comes from what photographs show out there
     """
     count = {word: words.count(word) for word in set(words)}
     total = len(words)
     told = [
         f"{count.get('measured', 0)} of {total} objects have a measured roughness and specular."
     ]
+    if metals:
+        told.append(f"{len(metals)} {_are(metals, 'a metal', 'metals')}: {_few(metals)}.")
     if prior := count.get("prior"):
         told.append(
             f"{prior} {'is' if prior == 1 else 'are'} not determined: no photograph shows a clear "
@@ -183,16 +190,18 @@ def findings(
             "was measured, and everything but a colour is a guess."
         )
     if unseen := count.get("unseen"):
-        told.append(f"No photograph shows {unseen if unseen < total else 'any'} of them.")
+        told.append(f"No photograph shows {unseen if unseen < total else 'any'} of the objects.")
     if lamps := count.get("lamp"):
         told.append(f"{lamps} {'is a lamp' if lamps == 1 else 'are lamps'}.")
     if shining_parts:
-        told.append(f"A part of {_few(shining_parts)} shines, too.")
+        one = len(shining_parts) == 1
+        parts = f"{'A part' if one else 'Parts'} of {_few(shining_parts)}"
+        told.append(f"{parts} {'shines' if one else 'shine'}, too.")
     texture, shade = found["texture"], found["shade"]
     if "measured_fraction" in texture:
         told.append(
             f"Photographs measured {texture['measured_fraction']:.1%} of the surface; "
-            f"{texture.get('clipped_fraction', 0):.2%} clipped in all of them; "
+            f"{texture.get('clipped_fraction', 0):.2%} clipped in all that show it; "
             f"{_glimpsed(texture)}the rest is filled in from around it."
         )
     if "standard_error" in shade:
@@ -200,7 +209,7 @@ def findings(
     if (escaped := shade.get("escaped_fraction", 0)) > 0.001:
         told.append(
             f"{escaped:.1%} of the directions in which surfaces look leave the scan. "
-            f"{_outside(shade.get('outside'))}"
+            f"{_outside(shade.get('outside'), dark=dark_outside)}"
         )
     estimated = list(shade.get("estimated_emitters", {}))
     for wanted in (False, True):
@@ -216,15 +225,21 @@ def _glimpsed(texture: Mapping[str, Any]) -> str:
     return f"{share:.2%} is too thin for that and was glimpsed; " if share >= 0.00005 else ""
 
 
-def _outside(found: Mapping[str, Any] | None) -> str:
+def _outside(found: Mapping[str, Any] | None, *, dark: bool) -> str:
     if found is None:
         return "What is out there counts as dark."
+    if dark:
+        return "It is dark out there, as by night: next to no light comes in."
     names = ["sky", *(["sun"] if "sun_direction" in found else [])]
     if found.get("source") != "estimated":
         return f"A file told the light from there: {' and '.join(names)}."
     errors = {name: found.get(f"{name}_error") for name in names}
-    told = [name if not e else f"{name} to \u00b1 {e:.0%}" for name, e in errors.items()]
-    return f"The light from there was estimated: {', '.join(told)}."
+    told = [
+        f"{name} to \u00b1 {e:.0%}" if e else f"{name} as photographs show it"
+        for name, e in errors.items()
+    ]
+    how = "was estimated" if any(errors.values()) else "is known"
+    return f"The light from there {how}: {', '.join(told)}."
 
 
 def _estimated_lamps(names: Sequence[str], *, never_observed: bool) -> list[str]:
@@ -236,6 +251,10 @@ def _estimated_lamps(names: Sequence[str], *, never_observed: bool) -> list[str]
     how = f"No photograph measures t{lamps}" if never_observed else f"T{lamps} clipped everywhere"
     what = "its radiance is an estimate" if one else "their radiances are estimates"
     return [f"{how}: {what}."]
+
+
+def _are(things: Sequence[str], one: str, many: str) -> str:
+    return f"is {one}" if len(things) == 1 else f"are {many}"
 
 
 def _few(names: Sequence[str]) -> str:

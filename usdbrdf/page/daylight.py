@@ -15,7 +15,7 @@ from usdbrdf.model.material import turned_up
 from usdbrdf.options import ESTIMATE, Surroundings
 from usdbrdf.page.pictures import data_uri
 from usdbrdf.shading.asked import looked_around
-from usdbrdf.transport.environment import Environment, pixels_of_directions
+from usdbrdf.transport.environment import Environment, pixels_of_directions, solid_angles
 from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.sunlight import sunlight
 
@@ -23,12 +23,15 @@ from usdbrdf.transport.sunlight import sunlight
 _POINTS, _RAYS, _SEED = 4096, 64, 0x0DA1
 # Pixels across the picture of the sky.
 _ACROSS = 512
+# What brings a smaller share of the room's usual light is the dark, as of a night.
+_DARK = 1e-3
 
 
 def daylight(
     atlas: AssetMaps, lit: LitScene, asked: Surroundings, up_axis: str, exposure: float
 ) -> dict[str, Any] | None:
-    """Of the surroundings of ``lit``, which were ``asked`` for; None where they are dark.
+    """Of the surroundings of ``lit``, which were ``asked`` for; None where they are dark, see
+    ``is_dark``.
 
     estimated  False where a file told them
     sky, sun   None where it is dark; ``direct`` is the irradiance that it brings, without what
@@ -38,7 +41,7 @@ def daylight(
     direction  unit, towards the sun, y up; with the irradiance where it shines
     """
     environment = lit.environment
-    if not (environment.image.any() or environment.sun.shines):
+    if is_dark(environment, atlas):
         return None
     found = light_from_outside(atlas.stage) if asked == ESTIMATE else None
     estimated = found is not None and found[0].source == "estimated"
@@ -61,6 +64,17 @@ def daylight(
             "error": error["sun"],
         }
     return told
+
+
+def is_dark(environment: Environment, atlas: AssetMaps) -> bool:
+    """Whether next to nothing comes from outside, as by night, though photographs show something
+    there."""
+    if environment.sun.shines:
+        return False
+    solid = solid_angles(*environment.image.shape[:2])
+    around = np.average(environment.image.mean(axis=(1, 2)), weights=solid)
+    usual = float(np.median(atlas.irradiance)) if atlas.has("irradiance") else 0.0
+    return bool(np.pi * around <= _DARK * usual)
 
 
 def area_of(lit: LitScene) -> float:

@@ -113,6 +113,7 @@ def _numbers(
         "class": obj.class_name,
         "prim": obj.prim_path,
         "status": status,
+        "because": undetermined_because(fit, status, in_sight=in_sight),
         "fit": fit.status,
         "kind": fit.kind,
         "directive": fit.directive or (shading.directive if shading else ""),
@@ -179,7 +180,9 @@ def why(
         shown = hardly if in_sight else "No photograph shows it"
         return f"{shown}: everything about it is a guess."
     if fit.is_metal:
-        return "A metal explains the views better than any dielectric: F0 takes the place of psi."
+        better = "A metal explains the views better than anything with a base colour"
+        known = "" if status == "measured" else " Its numbers are not known well."
+        return f"{better}: its reflectance, F0, takes the place of psi.{known}"
     if fit.is_contradicted:
         return (
             f"Its views contradict by {fit.contradiction:.0%} that it is a surface: something is "
@@ -268,7 +271,7 @@ def _pictures(
 
 def _was_fitted(fit: FittedObject, status: str) -> bool:
     """Whether there is a fit for a frame to be evidence of."""
-    return undetermined_because(fit, status) not in ("lamp", "unseen", "told", "sparse")
+    return undetermined_because(fit, status) not in ("lamp", "unseen", "told", "sparse", "pane")
 
 
 def _evidence(seen: ViewedAsset, frame: _LookedAt, index: int, seed: int) -> Double | None:

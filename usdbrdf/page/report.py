@@ -34,6 +34,7 @@ from usdbrdf.model.arrays import Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.options import ReportOptions
 from usdbrdf.page.capture import findings, frame_rows, room_map, summaries, warnings_of
+from usdbrdf.page.daylight import is_dark
 from usdbrdf.page.objects import object_rows, undetermined_because
 from usdbrdf.page.pictures import (
     data_uri,
@@ -162,6 +163,12 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
                 for name in _with_texels(atlas, lambda own: bool(atlas.emissive[own].any()))
                 if name not in lamps
             ],
+            metals=[
+                obj.identifier
+                for obj, fit in zip(atlas.scene.objects, fits, strict=True)
+                if fit is not None and fit.is_metal and obj.identifier not in lamps
+            ],
+            dark_outside=is_dark(seen.lit.environment, atlas),
         ),
         "warnings": _tellable(warnings_of(found), frames, pictures),
         "rows": [unnamed(row, pictures) for row in frame_rows(frames)],

@@ -22,6 +22,7 @@ from usdbrdf.model.material import turned_up
 from usdbrdf.options import PackageOptions, Surroundings
 from usdbrdf.page.daylight import area_of, daylight
 from usdbrdf.page.pictures import data_uri, status_of
+from usdbrdf.page.small_glb import small_glb
 from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.rays import RayScene
 
@@ -45,7 +46,7 @@ def room_model(
 ) -> dict[str, Any] | None:
     """What the page needs for its view in 3D; None, and a line that says why, where there is none.
 
-    glb    gzip, base64: y up, metres; nodes name their prims
+    glb    gzip, base64, see ``small_glb``: y up, metres; nodes name their prims
     first  where the view opens, see ``first_look``: as ``camera`` looked
     lit    by prim, the lit texture as a picture
     lamps  where those are that shine, y up, with their intensity as points, in the asset's units of
@@ -60,7 +61,7 @@ def room_model(
             options = PackageOptions(max_size=_TEXTURE, lighting=asset.lighting or None)
             # Its lights are told apart from it, and glTF is not what is handed over here.
             write_package(asset.folder, file, options, lambda _: None)
-            content = file.read_bytes()
+            content = small_glb(file.read_bytes())
     except UsdBrdfError as error:
         say(f"report: without the room in 3D: {error}")
         return None

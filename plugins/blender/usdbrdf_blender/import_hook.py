@@ -36,12 +36,27 @@ class UsdBrdfImport(bpy.types.USDHook):
                 if isinstance(item, bpy.types.Object | bpy.types.Material):
                     item[FILE], item[PRIM] = file, str(path)
                 if isinstance(item, bpy.types.Object):
+                    _shine_as_told(item, prim)
                     for name, value in facts.items():
                         item[name] = value
                     if root is not None:
                         _keep_looks(item, root)
                     _name_as_object(item, prim)
         return True
+
+
+def _shine_as_told(item, prim):
+    """A sun: Blender makes it four times as strong as USD says."""
+    if item.type != "LIGHT" or item.data.type != "SUN" or prim.GetTypeName() != "DistantLight":
+        return
+    told = {
+        name: prim.GetAttribute(f"inputs:{name}").Get()
+        for name in ("intensity", "exposure", "normalize")
+    }
+    if told["normalize"]:  # irradiance then, which is what Blender means by energy
+        item.data.energy = told["intensity"] * 2 ** (told["exposure"] or 0)
+        if hasattr(item.data, "exposure"):
+            item.data.exposure = 0
 
 
 def _name_as_object(item, prim):

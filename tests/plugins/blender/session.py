@@ -130,6 +130,13 @@ def plain_import(file):
     return {"properties": properties(), "surfaces": surfaces()}
 
 
+def suns(file):
+    """Irradiance of each sun after Blender's own import, with the add-on enabled."""
+    plain_import(file)
+    lights = [item.data for item in bpy.data.objects if item.type == "LIGHT"]
+    return [light.energy * 2 ** getattr(light, "exposure", 0) for light in lights]
+
+
 def package(file):
     """A package: by the add-on's operator, and by Blender's own."""
     told = {"plain": plain_import(file)["properties"]}

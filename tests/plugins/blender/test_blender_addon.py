@@ -300,3 +300,19 @@ def test_blender_builds_the_extension(source, tmp_path):
     [package] = tmp_path.glob("*.zip")
     with zipfile.ZipFile(package) as archive:
         assert {"__init__.py", "blender_manifest.toml"} <= set(archive.namelist())
+
+
+def test_a_sun_is_as_strong_as_the_asset_says(session, room, tmp_path):
+    layer = Sdf.Layer.CreateNew(str(tmp_path / "sun.usda"))
+    layer.subLayerPaths = [str(room)]
+    layer.defaultPrim = Sdf.Layer.FindOrOpen(str(room)).defaultPrim
+    sun = Sdf.CreatePrimInLayer(layer, f"/{layer.defaultPrim}/sun")
+    sun.specifier, sun.typeName = Sdf.SpecifierDef, "DistantLight"
+    for name, kind, value in (
+        ("intensity", Sdf.ValueTypeNames.Float, 1.0),
+        ("exposure", Sdf.ValueTypeNames.Float, 2.0),
+        ("normalize", Sdf.ValueTypeNames.Bool, True),
+    ):
+        Sdf.AttributeSpec(sun, f"inputs:{name}", kind).default = value
+    layer.Save()
+    assert session("suns", layer.realPath) == [pytest.approx(4.0)]

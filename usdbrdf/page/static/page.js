@@ -22,7 +22,10 @@
   const metres = (value) => `${value.toFixed(2)} m`;
   const STATUS = {
     measured: 'measured', prior: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
+    sparse: 'too few pixels', contradicted: 'seen through', pane: 'clear glass', told: 'left out', glimpsed: 'hardly shown',
   };
+  // Nothing was fitted of these: the numbers that they carry stand for nothing.
+  const UNFITTED = ['lamp', 'pane', 'told'];
 
   // So many are shown at once; the others, of scans with hundreds of objects, are folded.
   const MOST_WARNINGS = 8;
@@ -40,7 +43,7 @@
     $('lead').textContent = `${facts.frames} photographs, ${data.objects.length} objects, ${measured} measured`;
     $('findings').append(...data.findings.map((sentence) => el('li', {}, sentence)));
     const warned = (data.warnings || []).map((sentence) =>
-      el('p', { class: 'warning' }, el('strong', {}, 'Warning: '), sentence));
+      el('p', { class: 'warning' }, el('strong', {}, 'Warning: '), signs(sentence)));
     const first = warned.length > MOST_WARNINGS + 1 ? MOST_WARNINGS : warned.length;
     $('warnings').append(...warned.slice(0, first));
     if (first < warned.length) {
@@ -185,7 +188,7 @@
   const COLUMNS = [
     { name: 'Picture' },
     { name: 'Object', key: (one) => one.label.toLowerCase() },
-    { name: 'Status', wide: true, key: (one) => order.indexOf(one.status) },
+    { name: 'Status', wide: true, key: (one) => order.indexOf(one.because) },
     { name: 'Colour', wide: true, key: (one) => (one.base_color ? one.base_color[0] + one.base_color[1] + one.base_color[2] : -1) },
     { name: 'Roughness', sign: '\u03c6', key: (one) => one.phi ?? 9 },
     { name: 'Specular', sign: '\u03c8', key: (one) => (one.f0 ? 8 : one.psi ?? 9) },
@@ -198,7 +201,7 @@
 
   /* What the words of the trade say, for who judges without them. */
   const WORDS = {
-    Status: 'measured: the photographs determine roughness and specular. Not determined: no photograph shows a clear enough highlight, and the grey numbers are what remains likely. Unseen: no photograph shows enough of the object to measure anything.',
+    Status: 'measured: the photographs determine roughness and specular. Not determined: no photograph shows a clear enough highlight, and the grey numbers are what remains likely. Unseen: no photograph shows enough of the object to measure anything; hardly shown: only together with what is beside it; too few pixels: enough for a colour, not for more. Seen through: its views contradict that it is a surface; clear glass: photographs show the outside through it. Left out: a person said that nothing be fitted, by ignore or glass.',
     Colour: 'the mean of the base colour: what the object reflects to all sides, without highlights and without the light that fell on it.',
     'Roughness \u03c6': 'how wide highlights are: 0 a mirror, 1 matt (alpha of the GGX distribution; the roughness of most renderers is its square root). \u00b1: one standard deviation.',
     'Specular \u03c8': 'how strong they are: 0.5 is usual for wood, paint and plastics, 0 has none (what is mirrored straight ahead is 0.08 \u03c8 of the light). Of metals a colour, F0, takes its place.',
@@ -223,7 +226,7 @@
       head.append(cell);
     });
     for (const status of order) {
-      if (data.objects.some((one) => one.status === status)) {
+      if (data.objects.some((one) => one.because === status)) {
         $('filter-status').append(el('option', { value: status }, STATUS[status]));
       }
     }
@@ -241,7 +244,7 @@
     const picture = one.photograph || one.model;
     const swatch = el('span', { class: 'swatch', style: `background: ${css(one.base_color)}` });
     const number = (value, error, guess = false) => {
-      if (one.status === 'lamp') return ['\u2013'];
+      if (UNFITTED.includes(one.because)) return ['\u2013'];
       if (guess) return [fixed(value), el('span', { class: 'error' }, `, ${noMoreThan(one)}`)];
       // An error that would read as 0.00 gets another digit, and its number with it.
       const digits = error !== null && error < 0.005 ? 3 : 2;
@@ -258,7 +261,7 @@
     const specular = one.f0 && one.status !== 'lamp' ? ['metal'] : number(one.psi, one.psi_error, isGuess(one));
     const numberCss = (confidence) => (confidence === 'none' ? 'number guess' : 'number');
     const verdict = el('td', { class: 'wide' });
-    const status = (css) => el('span', { class: `status ${one.status} ${css}` }, STATUS[one.status]);
+    const status = (css) => el('span', { class: `status ${one.status} ${css}` }, STATUS[one.because]);
     const main = el('tr', { 'data-prim': one.prim },
       el('td', {}, picture ? el('img', { class: 'crop', src: picture, alt: `${one.label} in frame ${one.frame}` }) : ''),
       el('td', { class: 'named' }, opener, status('small')),
@@ -266,7 +269,7 @@
       el('td', { class: 'wide' }, one.status === 'lamp' ? 'shines' : swatch),
       el('td', { class: numberCss(one.phi_confidence) }, ...number(one.phi, one.phi_error)),
       el('td', { class: numberCss(one.psi_confidence) }, ...specular),
-      el('td', { class: 'wide' }, one.status === 'lamp' ? '\u2013' : `\u03c6 ${one.phi_confidence}, ${one.f0 ? 'F0' : '\u03c8'} ${one.psi_confidence}`),
+      el('td', { class: 'wide' }, UNFITTED.includes(one.because) ? '\u2013' : `\u03c6 ${one.phi_confidence}, ${one.f0 ? 'F0' : '\u03c8'} ${one.psi_confidence}`),
       el('td', { class: 'wide number' }, one.evidence === null ? '\u2013' : percent(one.evidence, 0)),
       el('td', { class: 'wide number' }, percent(one.seen, 0)),
       verdict);
@@ -304,7 +307,7 @@
     const fact = (name, value) => facts.append(el('dt', {}, name), el('dd', {}, value));
     if (one.status === 'lamp' && one.radiance) {
       fact('Radiance', `${one.radiance.mean.map((value) => value.toPrecision(3)).join(', ')} (${one.radiance.status})`);
-    } else {
+    } else if (!UNFITTED.includes(one.because)) {
       fact('Roughness \u03c6', `${fixed(one.phi, 3)} \u00b1 ${fixed(one.phi_error, 3)}, confidence ${one.phi_confidence}`);
       if (one.f0) fact('F0 of the metal', one.f0.map((value) => fixed(value, 3)).join(', '));
       else {
@@ -327,7 +330,7 @@
   /* What lobes leave unexplained of the target frame, over phi and psi. */
   function evidence(one) {
     const told = ['ignore', 'glass'].includes(one.directive);
-    const none = one.status === 'lamp' ? 'What shines by itself is not fitted.' : told ? 'Nothing was fitted, by directive.' : 'Too few pixels for a plot.';
+    const none = one.status === 'lamp' ? 'What shines by itself is not fitted.' : told ? 'Nothing was fitted, by directive.' : one.because === 'pane' ? 'Clear glass is not fitted.' : 'Too few pixels for a plot.';
     if (!one.costs) return [el('h3', {}, 'Evidence'), el('p', { class: 'soft' }, none)];
     const { phis, psis, values } = one.costs;
     const [width, height, left, top, side] = [290, 232, 38, 8, 200];
@@ -392,7 +395,7 @@
     let shown = 0;
     for (const entry of rows) {
       const { one } = entry, given = judged(one.prim).verdict;
-      const kept = one.label.toLowerCase().includes(name) && (!status || one.status === status)
+      const kept = one.label.toLowerCase().includes(name) && (!status || one.because === status)
         && (!verdict || (verdict === 'changed' ? Boolean(changed[one.prim]) : (given || 'none') === verdict));
       entry.main.hidden = !kept;
       entry.detail.hidden = !kept || entry.opener.getAttribute('aria-expanded') !== 'true';
@@ -602,8 +605,8 @@
     const picked = el('div', { class: 'picked', role: 'status' });
     const pick = (prim) => {
       const one = data.objects.find((other) => other.prim === prim);
-      picked.textContent = !one ? '' : one.status === 'lamp' ? `${one.label}: lamp`
-        : `${one.label}: ${STATUS[one.status]}, \u03c6 ${fixed(one.phi)} \u00b1 ${fixed(one.phi_error)}, ${one.f0
+      picked.textContent = !one ? '' : UNFITTED.includes(one.because) ? `${one.label}: ${STATUS[one.because]}`
+        : `${one.label}: ${STATUS[one.because]}, \u03c6 ${fixed(one.phi)} \u00b1 ${fixed(one.phi_error)}, ${one.f0
           ? `metal, F0 ${one.f0.map((value) => fixed(value)).join(', ')}` : `\u03c8 ${fixed(one.psi)}${isGuess(one) ? `, ${noMoreThan(one)}` : ` \u00b1 ${fixed(one.psi_error)}`}`}`;
       canvas.dataset.picked = one ? one.prim : '';
     };
