@@ -12,8 +12,8 @@ import pytest
 from usdbrdf.shading import clipped_emitters as module
 from usdbrdf.shading.clipped_emitters import (
     ERROR_ALONE,
-    LEAST_ERROR,
     LAMP_PRIOR,
+    LEAST_ERROR,
     EstimatedRadiance,
     Evidence,
     estimate_clipped_emitters,
