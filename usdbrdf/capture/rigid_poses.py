@@ -30,6 +30,13 @@ _AT_CORNER = 0.1
 _SHORTEST_PINHOLE = 0.1
 
 
+def rigid_pose(rotation: Double, centre: Double) -> Double:
+    """(4, 4) of a 3 x 3 rotation and a point."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, centre
+    return pose
+
+
 def rigid_records(
     records: Sequence[FrameRecord], findings: Findings, source: Path, *, pose_scale: float | None
 ) -> list[FrameRecord]:

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, scan_of_shots
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused, MeshMissing
 from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import Element, beginning_of_text, files_of, numbers_of, read_xml

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import CentredCamera, Shot, scan_of_shots
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
 from usdbrdf.files.tables import beginning_of, files_of, numbers_among
