@@ -150,6 +150,14 @@ def test_scenes_of_mapanything_are_read(capture):
     np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-12)
 
 
+def test_poses_with_columns_first_are_called_so(capture):
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+    with pytest.raises(InputRefused, match=r"its pose is transposed.*\[capture\.pose\]$"):
+        read_scan(capture.folder, IngestOptions())
+
+
 @pytest.mark.parametrize("key", ["sk_x", "skew"])
 def test_skew_is_the_number_beside_the_focal_length(capture, key):
     """It was read as none."""
