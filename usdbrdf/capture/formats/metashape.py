@@ -40,6 +40,7 @@ from usdbrdf.files.tables import (
     files_of,
     number_in,
     numbers_of,
+    only_one,
     read_xml,
 )
 from usdbrdf.model.arrays import Double
@@ -69,14 +70,9 @@ def _documents(path: Path) -> list[Path]:
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:
-    documents = _documents(path.resolve())
-    if len(documents) != 1:
-        said = f"{len(documents)} exports of cameras" if documents else "no export of cameras"
-        raise InputRefused(
-            f"{path}: {said} (XML with sensors and cameras). Name the file, which File > Export > "
-            "Export Cameras writes. [capture.format]"
-        )
-    (source,) = documents
+    called = "exports of cameras (XML with sensors and cameras)"
+    how = "Name the file, which File > Export > Export Cameras writes"
+    source = only_one(_documents(path.resolve()), path, called, how)
     folder, findings = source.parent, Findings()
     pictures = pictures_of(folder, options)
     refuse_without_pictures(pictures, source)

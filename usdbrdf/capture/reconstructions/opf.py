@@ -24,7 +24,7 @@ from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, rows_of, sca
 from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
-from usdbrdf.files.tables import beginning_of, files_of, number_in, numbers_among
+from usdbrdf.files.tables import beginning_of, files_of, number_in, numbers_among, only_one
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens, fisheye_of_turn, is_fisheye_of_turn, whole_sphere
@@ -53,10 +53,7 @@ def _documents(path: Path) -> list[Path]:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
-    if len(documents) != 1:
-        said = f"{len(documents) or 'no'} projects .opf"
-        raise InputRefused(f"{path}: {said}. Name the one of the calibration. [capture.format]")
-    (source,) = documents
+    source = only_one(documents, path, "projects .opf", "Name the one of the calibration")
     lists, sensors, cameras, frames = (
         _resources(source, kind, options) for kind in (_PICTURES, _SENSORS, _CAMERAS, _FRAME)
     )
