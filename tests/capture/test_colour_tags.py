@@ -231,7 +231,7 @@ ACESCG = ((0.68988, 0.28451, -0.00605), (0.14976, 0.67169, 0.01001), (0.12456, 0
     [
         (ACESCG, "none", "lin_ap1_scene", "are read so"),
         (PROPHOTO, "none", "lin_rec709_scene", "'Anzeige P3', which is not read here"),
-        (SRGB, "sRGB's table", "lin_rec709_scene", "made of it (srgb_rec709_scene)"),
+        (SRGB, "sRGB's table", "lin_rec709_scene", "values are for a display (srgb_rec709_scene)"),
     ],
 )
 def test_floats_have_the_space_of_the_profile_in_them(capture, columns, curve, encoding, told):

@@ -264,8 +264,8 @@ def tagged_encoding(
                 said = ", ".join(f"{place:.4g}" for place in places)
                 unknown.setdefault(record.image_path, f"primaries and white are {said}")
             elif tag is not None and display != ((kind := kind_of_encoding(tag)) == "display"):
-                made = "linear" if kind == "linear" else "no light, but made of it"
-                unknown.setdefault(record.image_path, f"values are {made} ({tag})")
+                said = {"linear": "linear", "log": "logarithms"}.get(kind or "", "for a display")
+                unknown.setdefault(record.image_path, f"values are {said} ({tag})")
             alike = tag is not None and (kind_of_encoding(tag) == "display") == display
             first_of.setdefault(tag if tag and alike else usual, record.image_path)
     if first_of.keys() == {DISPLAY_SPACE, "g22_rec709_scene"}:  # as many programs tag sRGB in PNG

@@ -69,11 +69,13 @@ def composed(name: str) -> str:
 
 def ends_of(path: str) -> list[str]:
     """The ends of a path that leads elsewhere, the longest first: of a capture that was moved, or
-    comes from another machine, one of them leads to the same file within it. None of a URI."""
+    comes from another machine, one of them leads to the same file within it. None of a URI; and of
+    ../ not the name alone, which says too little where all the way to it is known."""
     parts = [] if "://" in path else path.replace("\\", "/").split("/")
     downwards = len(parts) - parts[::-1].index("..") if ".." in parts else 0
     names = [name for name in parts[downwards:] if name.strip(".~") and name[-1] != ":"]
-    return ["/".join(names[i:]) for i in range(len(names))[-_MOST_ENDS:]]
+    fewest = 2 if downwards else 1
+    return ["/".join(names[i:]) for i in range(len(names) - fewest + 1)[-_MOST_ENDS:]]
 
 
 def meant_by(
