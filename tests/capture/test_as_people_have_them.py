@@ -233,12 +233,57 @@ def test_of_many_pictures_of_one_name_each_is_found_by_its_path_at_once(tmp_path
 
 
 @pytest.mark.parametrize("place", ["/home/me/scan/", "C:\\Users\\me\\scan\\", "../fox/"])
-def test_frames_named_where_they_lay_on_another_machine_need_their_folder(made, place):
+def test_frames_named_where_they_lay_on_another_machine_are_found_or_need_their_folder(made, place):
+    """What lies at the end of their paths in the capture's own folder is meant; nothing else is."""
+    is_absolute = not place.startswith("..")
+    with edited(made.manifest) as document:
+        document["mesh"] = f"{place}mesh.ply" if is_absolute else "mesh.ply"
     _rename(made, place + "frames/{:04d}.exr")
+    scan = _read(made)
+    assert list(scan.frames.image_paths) == [made.image(i).resolve() for i in range(12)]
+    (pictures, *mesh) = (said for said in scan.warnings if "[capture.moved]" in said)
+    assert "12 of the files" in pictures
+    assert ["its mesh lies elsewhere" in said for said in mesh] == [True] * is_absolute
+    made.image(3).unlink()
+    assert len(_read(made).frames) == 11
+    (made.folder / "frames").rename(made.folder / "radiance")
     with pytest.raises(InputRefused, match=r"Name the folder of the pictures with --frames,"):
         _read(made)
-    scan = _read(made, frames=made.folder / "frames")
-    np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera)
+    scan = _read(made, frames=made.folder / "radiance")
+    assert len(scan.frames) == 11
+
+
+@pytest.mark.parametrize("through_a_link", [False, True])
+def test_frames_may_be_named_by_absolute_paths_into_the_capture(made, tmp_path, through_a_link):
+    """As many programs write them. Of radiance beside the JPEGs that are named that is taken, here
+    too; masks as well."""
+    home = made.folder
+    if through_a_link:
+        home = tmp_path / "link"
+        home.symlink_to(made.folder)
+    with edited(made.manifest) as document:
+        document["mesh"] = f"{home}/mesh.ply"
+    _rename(made, f"{home}/frames/{{:04d}}.jpg")
+    scan = _read(made)
+    assert list(scan.frames.image_paths) == [made.image(i).resolve() for i in range(12)]
+    assert not any("[capture.moved]" in said for said in scan.warnings)
+    _write_bytes(made.folder / "masks" / "0.png", np.full((24, 32, 3), 255, np.uint8))
+    with edited(made.manifest) as document:
+        document["frames"][0]["mask_path"] = f"{home}/masks/0.png"
+    assert any("1 masks are used" in said for said in _read(made).warnings)
+
+
+def test_what_lies_outside_is_not_opened_however_its_path_ends(made, tmp_path):
+    """Neither itself, nor through a link at the end of its path in the capture."""
+    (tmp_path / "other").mkdir()
+    made.image(0).rename(tmp_path / "other" / "0000.exr")
+    with edited(made.manifest) as document:
+        document["frames"][0]["file_path"] = str(tmp_path / "other" / "0000.exr")
+    with pytest.raises(InputRefused, match=r"absolute path.*\[paths\.outside\]$"):
+        _read(made)
+    (made.folder / "other").symlink_to(tmp_path / "other")
+    with pytest.raises(InputRefused, match=r"absolute path.*\[paths\.outside\]$"):
+        _read(made)
 
 
 def test_the_rolling_shutter_of_instant_ngp_is_told(made):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -221,6 +222,79 @@ def _profile_of_numbers(columns, curve: str, name: str = "Anzeige P3", language:
     return struct.pack(">I", 132 + 12 * len(tags) + len(body)) + head + table + body
 
 
+# XYZ of the primaries of ACEScg (Academy S-2014-004), adapted to D50.
+ACESCG = ((0.68988, 0.28451, -0.00605), (0.14976, 0.67169, 0.01001), (0.12456, 0.0438, 0.82094))
+
+
+@pytest.mark.parametrize(
+    ("columns", "curve", "encoding", "told"),
+    [
+        (ACESCG, "none", "lin_ap1_scene", "are read so"),
+        (PROPHOTO, "none", "lin_rec709_scene", "'Anzeige P3', which is not read here"),
+        (SRGB, "sRGB's table", "lin_rec709_scene", "values are for a display (srgb_rec709_scene)"),
+    ],
+)
+def test_floats_have_the_space_of_the_profile_in_them(capture, columns, curve, encoding, told):
+    """They passed for Rec.709's without a word."""
+    icc = np.frombuffer(_profile_of_numbers(columns, curve, language="enUS"), np.uint8)
+    with edited(capture.folder / "transforms.json") as document:
+        for i, frame in enumerate(document["frames"]):
+            frame["file_path"] = f"frames/{i}.tif"
+            pixels = read_radiance(capture.image(i))
+            spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "float")
+            spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(icc)}]"), icc)
+            output = oiio.ImageOutput.create(str(capture.folder / frame["file_path"]))
+            assert output.open(str(capture.folder / frame["file_path"]), spec)
+            assert output.write_image(pixels)
+            assert output.close()
+    scan = read_scan(capture.folder, IngestOptions())
+    assert scan.frames.encoding == encoding
+    (sentence,) = (said for said in scan.warnings if "[capture.encoding]" in said)
+    assert told in sentence
+
+
+def _png(path, chunks):
+    """One colour, after the PNG specification, with chunks before the pixels."""
+    whole = b"\x89PNG\r\n\x1a\n"
+    pixels = zlib.compress(b"".join(b"\0" + bytes([64, 128, 32] * 8) for _ in range(8)))
+    header = struct.pack(">IIBBBBB", 8, 8, 8, 2, 0, 0, 0)
+    for name, data in [(b"IHDR", header), *chunks, (b"IDAT", pixels), (b"IEND", b"")]:
+        check = zlib.crc32(name + data)
+        whole += struct.pack(">I", len(data)) + name + data + struct.pack(">I", check)
+    path.write_bytes(whole)
+
+
+def _primaries(*places):
+    """cHRM, of x, y of white, red, green and blue."""
+    return b"cHRM", struct.pack(">8I", *(round(100_000 * place) for place in places))
+
+
+_OF_P3 = _primaries(0.3127, 0.329, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)
+_OF_REC709 = _primaries(0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06)
+_OF_2020 = _primaries(0.3127, 0.329, 0.708, 0.292, 0.17, 0.797, 0.131, 0.046)
+_AS_SRGB, _LINEAR = (b"gAMA", struct.pack(">I", 45455)), (b"gAMA", struct.pack(">I", 100000))
+
+
+@pytest.mark.parametrize(
+    ("chunks", "known"),
+    [
+        ([_AS_SRGB, _OF_P3], "srgb_p3d65_scene"),
+        ([_OF_P3], "srgb_p3d65_scene"),
+        ([_LINEAR, _OF_P3], "lin_p3d65_scene"),
+        ([_AS_SRGB, _OF_REC709], "g22_rec709_scene"),
+        ([(b"sRGB", b"\0"), _AS_SRGB, _OF_P3], "srgb_rec709_scene"),
+        ([_AS_SRGB, _OF_2020], None),
+        ([(b"cHRM", b"short")], "srgb_rec709_scene"),
+    ],
+)
+def test_a_png_has_the_primaries_that_it_states(tmp_path, chunks, known):
+    """They were not heeded: P3 passed for sRGB without a word."""
+    _png(tmp_path / "a.png", chunks)
+    name, places = colour_tag(tmp_path / "a.png")
+    assert encoding_of_tag(name, places) == known
+    assert known or name.startswith("primaries and white 0.708, 0.292")
+
+
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 @pytest.mark.parametrize(
     ("columns", "curve", "known"),
@@ -251,7 +325,9 @@ def test_a_profile_described_in_no_known_language_is_known_by_its_numbers(
         (ADOBE, "2.2", "g22_adobergb_scene"),
         (ADOBE, "2.2 as a formula", "g22_adobergb_scene"),
         (SRGB, "2.2", ""),
-        (P3, "none", ""),
+        (P3, "none", "lin_p3d65_scene"),
+        (ACESCG, "none", "lin_ap1_scene"),
+        (PROPHOTO, "none", ""),
         (PROPHOTO, "2.2", ""),
     ],
 )

@@ -107,6 +107,28 @@ def write_project(folder, room):
     return _write(folder, document, room)
 
 
+@pytest.mark.parametrize(
+    ("place", "text", "told"),
+    [
+        ("camera", "0 0 0 0.1 -0.02 3e-3", True),
+        ("camera", "0 0 0 0 0.0 0e+00", False),
+        ("sensor", "true", True),
+        ("sensor", "Disabled", False),
+        ("sensor", None, False),
+    ],
+)
+def test_a_rolling_shutter_is_told(project, place, text, told):
+    """Metashape compensates for it, which was passed over in silence."""
+    document = ET.parse(project / "cameras.xml")
+    holder = document.getroot().find(f".//{place}")
+    _child(holder, "rolling_shutter", text)
+    document.write(project / "cameras.xml")
+    findings = Findings()
+    pictures = pictures_of(project, OPTIONS)
+    assert len(frame_records(project / "cameras.xml", pictures, OPTIONS, findings)) > 5
+    assert [s for s in findings.warnings if "[capture.shutter]" in s] == findings.warnings[:told]
+
+
 def test_cameras_of_a_chunk(project, room):
     assert choose_adapter(project).name == "metashape"
     assert choose_adapter(project / "cameras.xml").name == "metashape"

@@ -9,6 +9,8 @@ import pytest
 
 from tests.scenes import as_mitsubas, edited, make_capture, rescale_images, room_mesh, write_ply
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.checks import Findings
+from usdbrdf.capture.formats.transforms import frame_records
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr, write_preview_png
@@ -73,6 +75,110 @@ def test_lenses_of_instant_ngp_that_are_not_read_are_refused(capture, key, value
         document[key] = value
     said = rf"has the camera model '{key}' \(known: PINHOLE.*\[capture\.camera\]$"
     with pytest.raises(InputRefused, match=said):
+        read_scan(capture.folder, IngestOptions())
+
+
+def _as_opencvs(capture):
+    """The same poses with y down and z forward."""
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            frame["transform_matrix"] = (
+                np.array(frame["transform_matrix"]) * [1, -1, -1, 1]
+            ).tolist()
+
+
+@pytest.mark.parametrize(
+    ("key", "word"),
+    [
+        ("camera_convention", "opencv"),
+        ("convention", "OpenCV c2w"),
+        ("camera_coordinate_system", "RDF"),
+        ("coordinate_convention", "COLMAP"),
+    ],
+)
+def test_cameras_that_are_said_to_be_opencvs_are(capture, key, word):
+    """They passed for OpenGL's without a word."""
+    _as_opencvs(capture)
+    with edited(capture.manifest) as document:
+        document[key] = word
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-12)
+    assert any(word in said and "[capture.convention]" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ({"camera_convention": "OpenGL"}, None),
+        ({"camera_convention": "blender", "world_convention": "opencv"}, None),
+        ({"camera_convention": {"x": "right"}}, None),
+        ({"pose_convention": "world_to_camera"}, "not known here"),
+    ],
+)
+def test_axes_that_are_stated_otherwise_are_opengls_and_what_is_unknown_is_told(
+    capture, said, told
+):
+    with edited(capture.manifest) as document:
+        document |= said
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-12)
+    sentences = [one for one in scan.warnings if "[capture.convention]" in one]
+    assert [told in one for one in sentences] == ([True] if told else [])
+
+
+def test_two_conventions_are_refused(capture):
+    with edited(capture.manifest) as document:
+        document |= {"camera_convention": "opencv", "convention": "opengl"}
+    with pytest.raises(InputRefused, match=r"states two conventions.*\[capture\.convention\]$"):
+        read_scan(capture.folder, IngestOptions())
+
+
+def test_scenes_of_mapanything_are_read(capture):
+    """WAI: nerfstudio's document by another name, with OpenCV's cameras and keys of its own."""
+    _as_opencvs(capture)
+    with edited(capture.manifest) as document:
+        document |= {
+            "scene_name": "room", "dataset_name": "ours", "version": "0.1",
+            "shared_intrinsics": True, "camera_convention": "opencv", "scene_modalities": {},
+            "_applied_transform": np.eye(4).tolist(), "_applied_transforms": {},
+        }  # fmt: skip
+        for i, frame in enumerate(document["frames"]):
+            frame |= {"frame_name": f"{i:04d}", "image": frame["file_path"]}
+    capture.manifest.rename(capture.folder / "scene_meta.json")
+    scan = read_scan(capture.folder, IngestOptions())
+    assert scan.adapter == "transforms"
+    np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-12)
+
+
+def test_poses_with_columns_first_are_called_so(capture):
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            frame["transform_matrix"] = np.transpose(frame["transform_matrix"]).tolist()
+    with pytest.raises(InputRefused, match=r"its pose is transposed.*\[capture\.pose\]$"):
+        read_scan(capture.folder, IngestOptions())
+
+
+@pytest.mark.parametrize("key", ["sk_x", "skew"])
+def test_skew_is_the_number_beside_the_focal_length(capture, key):
+    """It was read as none."""
+    with edited(capture.manifest) as document:
+        document[key] = 3.0
+    (record, *_) = frame_records(capture.manifest, IngestOptions(), Findings())
+    fx, fy, cx, cy = capture.intrinsics
+    matrix = np.array([[fx, 3.0, cx], [0, fy, cy], [0, 0, 1]])
+    points = np.array([[0.2, -0.3, 1.0], [0.1, 0.4, 1.0], [-0.5, 0.1, 1.0]])
+    imaged = record.lens.project(points * [1, -1, -1], record.intrinsics)
+    np.testing.assert_allclose(imaged, (points @ matrix.T)[:, :2], atol=1e-9)
+
+
+@pytest.mark.parametrize("key", ["b1", "p3", "sk_y"])
+def test_terms_of_a_lens_that_are_not_read_are_refused_unless_they_are_nothing(capture, key):
+    with edited(capture.manifest) as document:
+        document[key] = 0
+    assert len(read_scan(capture.folder, IngestOptions()).frames) == 12
+    with edited(capture.manifest) as document:
+        document["frames"][2][key] = 1e-3
+    with pytest.raises(InputRefused, match=rf"has {key} 0\.001.*\[capture\.camera\]$"):
         read_scan(capture.folder, IngestOptions())
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
+from tests.scenes import make_capture
 from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
@@ -210,6 +212,18 @@ def test_the_folder_above_a_capture_names_the_one_to_ask_for(tmp_path):
     (tmp_path / "export/scene/transforms.json").write_text("{}")
     said = _refused(tmp_path)
     assert said.startswith(": no capture itself, but export/scene/ in it is one (transforms). Name")
+
+
+@pytest.mark.parametrize("part", ["frames", "frames/0003.exr", "mesh.ply"])
+def test_a_part_of_a_capture_names_the_folder_to_ask_for(tmp_path, monkeypatch, part):
+    """It was to have its cameras found, which are there."""
+    made = make_capture(tmp_path / "room", subdivisions=1)
+    said = rf" of the capture in {re.escape(str(made.folder))}\. Name that folder"
+    with pytest.raises(InputRefused, match=said):
+        choose_adapter(made.folder / part)
+    monkeypatch.chdir(made.folder / "frames")
+    with pytest.raises(InputRefused, match=said):
+        choose_adapter(Path())
 
 
 def test_a_stage_whose_prims_are_called_as_a_programs_words_is_none_of_its_documents(tmp_path):

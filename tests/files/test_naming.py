@@ -7,7 +7,7 @@ import re
 import pytest
 from pxr import Sdf
 
-from usdbrdf.files.naming import identifier_from, readable_label, unique_identifiers
+from usdbrdf.files.naming import ends_of, identifier_from, readable_label, unique_identifiers
 
 
 @pytest.mark.parametrize(
@@ -112,3 +112,24 @@ def test_names_of_devices_are_no_files(name):
 def test_labels_keep_what_usd_can_store():
     assert readable_label("Stuhl\tN\u00ba 1\x7f\x85") == "Stuhl\ufffdN\u00ba 1\ufffd\ufffd"
     assert readable_label("\ud800a") == "?a"
+
+
+@pytest.mark.parametrize(
+    ("path", "ends"),
+    [
+        ("/home/me/a.exr", ["home/me/a.exr", "me/a.exr", "a.exr"]),
+        ("C:\\scans\\a.exr", ["scans/a.exr", "a.exr"]),
+        ("~/scan//./a.exr", ["scan/a.exr", "a.exr"]),
+        ("../old/images/a.exr", ["old/images/a.exr", "images/a.exr"]),
+        ("x/../../a.exr", []),
+        ("/etc/..", []),
+        ("https://host/images/a.exr", []),
+        ("", []),
+    ],
+)
+def test_ends_of_paths_that_lead_elsewhere(path, ends):
+    assert ends_of(path) == ends
+
+
+def test_of_endless_paths_few_ends_are_asked():
+    assert len(ends_of("/x" * 5000)) <= 16

@@ -183,11 +183,12 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
 
     with environment_failures(str(path)):
         below = next(_recognised_below(path, sound), None)
+        above = next(_recognised_above(path, sound), None)
         said = (
             f"no capture itself, but {below[0].as_posix()}/ in it is one ({below[1].name}). Name "
             "that folder"
             if below
-            else f"no capture of a known format: {what_lies_there(path)}"
+            else f"no capture of a known format: {what_lies_there(path, above=above)}"
         )
     raise InputRefused(
         f"{path}: {said}, or state the format with --adapter (`usdbrdf adapters` lists what each "
@@ -204,6 +205,14 @@ def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, 
             for adapter in sound:
                 if adapter.module and adapter.name in MODULES and adapter.module.matches(folder):
                     yield folder.relative_to(path), adapter
+
+
+def _recognised_above(path: Path, sound: list[Adapter]) -> Iterator[Path]:
+    """Folders that it lies in, two at most, that one of our adapters recognises."""
+    for folder in path.absolute().parents[:2]:
+        ours = (a.module for a in sound if a.module and a.name in MODULES)
+        if any(module.matches(folder) for module in ours):
+            yield folder
 
 
 def refuse_missing(path: Path) -> None:

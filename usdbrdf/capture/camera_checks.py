@@ -76,6 +76,14 @@ def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> floa
     )
 
 
+def warn_of_rolling_shutter(source: Path, findings: Findings) -> None:
+    """One sentence, the same for all formats that state one."""
+    findings.warn(
+        f"{source.name}: states a rolling_shutter, which is not undone: what a camera took while "
+        "it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
+    )
+
+
 def drop_cameras_inside(
     frames: Frames,
     mesh: ScanMesh,

@@ -14,7 +14,7 @@ import numpy as np
 
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.atomic import sha256_of
-from usdbrdf.files.colour import DISPLAY_SPACE, encoding_of_tag, kind_of_encoding
+from usdbrdf.files.colour import DISPLAY_SPACE, encoding_of_tag, kind_of_encoding, says_light
 from usdbrdf.files.frames import FramePixels, read_frame, read_frames
 from usdbrdf.files.images import (
     colour_tag,
@@ -258,13 +258,14 @@ def tagged_encoding(
         with suppress(ImageRefused):  # of which the reader of its pixels will tell
             name, places = colour_tag(record.image_path)
             tag = encoding_of_tag(name, places)
-            if tag is None and (name and display):
+            if tag is None and name and (display or not says_light(name)):
                 unknown.setdefault(record.image_path, f"colour space is {name!r}")
             elif tag is None and places:
                 said = ", ".join(f"{place:.4g}" for place in places)
                 unknown.setdefault(record.image_path, f"primaries and white are {said}")
-            elif tag is not None and display and kind_of_encoding(tag) == "linear":
-                unknown.setdefault(record.image_path, f"values are linear ({tag})")
+            elif tag is not None and display != ((kind := kind_of_encoding(tag)) == "display"):
+                said = {"linear": "linear", "log": "logarithms"}.get(kind or "", "for a display")
+                unknown.setdefault(record.image_path, f"values are {said} ({tag})")
             alike = tag is not None and (kind_of_encoding(tag) == "display") == display
             first_of.setdefault(tag if tag and alike else usual, record.image_path)
     if first_of.keys() == {DISPLAY_SPACE, "g22_rec709_scene"}:  # as many programs tag sRGB in PNG

@@ -1,5 +1,6 @@
-"""In which frame a mesh lies: where the points lie on it that its photographs share, and in which
-scene of several cameras a document stands whose own mesh is that of the scene."""
+"""Which mesh is a capture's, and in which frame it lies: where the points lie on it that its
+photographs share, and in which scene of several cameras a document stands whose own mesh is that of
+the scene."""
 
 from __future__ import annotations
 
@@ -9,11 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, MeshMissing
+from usdbrdf.files.paths import contained, seen_of
+from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import colmap_points
+from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.mesh_files import mesh_from_file
+from usdbrdf.untrusted.mesh_ply import LONGEST_HEADER, holds_points_alone
+from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 # Places on the mesh, faces that are looked at at a time, or whose corners are compared, and points
 # that are; fewer of these say nothing.
@@ -25,6 +32,30 @@ _ON_IT, _CLEARLY = 0.1, 3.0
 _FITS = 0.05
 # Folders of a scene of ScanNet++, which hold nerfstudio/ and colmap/.
 _OF_SCANNETPP = ("dslr", "iphone")
+_MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
+_UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
+
+
+def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) -> Path:
+    """``--mesh``, else the first of the ``usual`` files (patterns) that is there, else the one mesh
+    of the folder; MeshMissing, which says ``how`` to get one, where there is none."""
+    if options.mesh is not None:
+        return options.mesh
+    for pattern in usual:
+        found = [p for p in seen_of(folder.glob(pattern)) if p.suffix.lower() in _MESHES]
+        if found:
+            return contained(folder, found[0].relative_to(folder).as_posix())
+    there = [p for p in seen_of(folder.iterdir()) if p.suffix.lower() in _MESHES]
+    others = [p for p in there if not holds_points_alone(beginning_of(p, LONGEST_HEADER))]
+    if len(others) == 1:
+        return contained(folder, others[0].name)
+    unread = [p.name for p in seen_of(folder.iterdir()) if p.suffix.lower() in _UNREAD_MESHES]
+    said = f"{len(others)} meshes" if others else "no mesh"
+    if unread and not others:
+        said += f" that is read ({unread[0]} is none of {', '.join(_MESHES)})"
+    elif there and not others:
+        said += f" ({there[0].name} holds points alone)"
+    raise MeshMissing(f"{folder}: {said}. {how}, or name one with --mesh. [mesh.missing]")
 
 
 def scene_above(document: Path) -> Path | None:

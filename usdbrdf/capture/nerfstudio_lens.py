@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from usdbrdf.errors import InputRefused
@@ -16,6 +17,10 @@ _CURVES: dict[str, Curve] = {
     "FISHEYE624": "fisheye", "EQUIRECTANGULAR": "equirectangular",
 }  # fmt: skip
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+# What no kept program writes, and whose meaning differs between those that have such terms.
+_UNREAD = ("sk_y", "b1", "b2", "p3", "p4", "k7", "k8", "tau_x", "tau_y")
+# In pixels: by so many columns a point moves that lies a focal length below the axis.
+_SKEW = ("sk_x", "skew", "skew_x")
 # Lenses that instant-ngp has by a key: the longitudes and latitudes of a whole sphere, their
 # equal-area cylinder, none, and a polynomial of the pixels' distance.
 _NGP_LENSES = ("latlong", "equirectangular", "orthographic", "ftheta_p0")
@@ -47,9 +52,15 @@ def lens_of_frame(
     curve = _CURVES[model]
     if curve == "equirectangular":
         return Lens(curve=curve)
+    if unread := next((key for key in _UNREAD if number(key)), None):
+        raise refuse(
+            f"has {unread} {number(unread):g}, a term of its lens that is not read. Undistort the "
+            "images to a pinhole camera first, or remove it."
+        )
+    skew = _skew(number, refuse)
     circle = _circle(number, refuse) if curve == "fisheye" else math.inf
     if (listed := said.get("distortion_params")) is not None:
-        return _listed_lens(curve, listed, circle, refuse)
+        return replace(_listed_lens(curve, listed, circle, refuse), skew=skew)
     terms = {key: number(key) for key in _DISTORTION}
     k1, k2, k3, k4, k5, k6, p1, p2, s1, s2, s3, s4 = (value or 0.0 for value in terms.values())
     divides = terms["k5"] is not None or terms["k6"] is not None
@@ -59,8 +70,18 @@ def lens_of_frame(
         divisor=(k4, k5, k6) if divides else (),
         tangential=(p1, p2),
         prism=(s1, s2, s3, s4),
+        skew=skew,
         circle=circle,
     )
+
+
+def _skew(number: Callable[[str], float | None], refuse: Callable[[str], InputRefused]) -> float:
+    """In focal lengths, as ``Lens`` has it."""
+    stated = next((value for key in _SKEW if (value := number(key))), 0.0)
+    focal = number("fl_x")
+    if stated and not focal:
+        raise refuse(f"has a skew of {stated:g} pixels, but no fl_x. State it, or remove the skew.")
+    return stated / focal if stated and focal else 0.0
 
 
 def _lens_key(said: Mapping[str, Any]) -> str:

@@ -30,6 +30,13 @@ _AT_CORNER = 0.1
 _SHORTEST_PINHOLE = 0.1
 
 
+def rigid_pose(rotation: Double, centre: Double) -> Double:
+    """(4, 4) of a 3 x 3 rotation and a point."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, centre
+    return pose
+
+
 def rigid_records(
     records: Sequence[FrameRecord], findings: Findings, source: Path, *, pose_scale: float | None
 ) -> list[FrameRecord]:
@@ -45,9 +52,11 @@ def rigid_records(
     for record in records:
         pose = record.world_from_camera
         if not is_camera_matrix(pose):
-            findings.drop(
-                record.name, "its pose is not a finite 4 x 4 camera matrix", "capture.pose"
-            )
+            why = "not a finite 4 x 4 camera matrix"
+            if is_camera_matrix(pose.T):
+                why = "transposed, as programs write it that have columns first: its last column"
+                why += " is 0 0 0 1, which is the last row's"
+            findings.drop(record.name, f"its pose is {why}", "capture.pose")
         elif said := _why_no_camera(record, offsets):
             findings.drop(record.name, said, "capture.camera")
         else:

@@ -291,8 +291,11 @@ def other_program(document: Path) -> str:
     return ""
 
 
-def what_lies_there(path: Path) -> str:
-    """One sentence on what a folder or file is that is no capture, one on what to do."""
+def what_lies_there(path: Path, *, above: Path | None = None) -> str:
+    """One sentence on what a folder or file is that is no capture, one on what to do.
+
+    above  a folder that it lies in and that is a capture: its pictures or mesh are that one's
+    """
     if path.is_file() and path.name in _OF_COLMAP:
         return (
             f"{path.name} is a part of a COLMAP model. Name the folder that holds the model and "
@@ -338,6 +341,8 @@ def what_lies_there(path: Path) -> str:
         return said
     if not held:
         return "it holds neither pictures nor cameras. Name the folder that holds the capture"
+    if above is not None:
+        return f"it holds {held} of the capture in {above}. Name that folder"
     how = (
         "Export them with the mesh as USD, or bring the scanning program's document of its cameras"
         if any(mesh.suffix.lower() in _SCENES for mesh in meshes)

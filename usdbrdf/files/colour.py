@@ -66,6 +66,7 @@ _CALLED_SRGB = re.compile(
     r"(?!.*(p3|2020|adobe|prophoto|wide|\bap[01]\b|aces))"
     r".*\bsrgb(?![ _-]*(trc|curve|gamma|tone|transfer))"
 )
+_GENERIC_LINEAR = re.compile(r"(?i)(scene[ _-]?)?lin(ear)?|raw|data|unknown|none")
 _UNKNOWN_SHOWN_AS = (255, 0, 255)
 # Pictures are exposed so that this percentile comes out as this linear value.
 _SHOWN_PERCENTILE, _SHOWN_AS = 90, 0.8
@@ -99,11 +100,21 @@ def encoding_of_tag(name: str, chromaticities: tuple[float, ...]) -> str | None:
         return name
     if _CALLED_SRGB.match(profile):
         return DISPLAY_SPACE
+    return space_of_primaries(chromaticities) if chromaticities else None
+
+
+def space_of_primaries(chromaticities: tuple[float, ...]) -> str | None:
+    """The scene-linear space of x, y of red, green, blue and white; None of others."""
     for encoding, places in _CHROMATICITIES.items():
-        close = chromaticities and np.abs(np.subtract(places, chromaticities)).max() < _SAME_PLACE
+        close = np.abs(np.subtract(places, chromaticities)).max() < _SAME_PLACE
         if close and kind_of_encoding(encoding):
             return encoding
     return None
+
+
+def says_light(name: str) -> bool:
+    """Whether a name says no more than that values are light, or nothing."""
+    return _GENERIC_LINEAR.fullmatch(name.strip()) is not None
 
 
 def unknown_encoding(encoding: str) -> str:
@@ -144,6 +155,11 @@ def to_working_space(pixels: Float, encoding: str) -> Float:
 def from_working_space(pixels: Float, encoding: str) -> Float:
     """A copy of (H, W, 3) float32 pixels of linear Rec.709 in another scene-linear space."""
     return _converted(pixels, WORKING_SPACE, encoding)
+
+
+def linear_spaces() -> tuple[str, ...]:
+    """The scene-linear spaces that files are known to have by their primaries."""
+    return tuple(_CHROMATICITIES)
 
 
 def chromaticities_of(encoding: str) -> tuple[float, ...]:

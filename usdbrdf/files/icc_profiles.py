@@ -8,14 +8,15 @@ from functools import cache
 
 import numpy as np
 
-from usdbrdf.files.colour import chromaticities_of
+from usdbrdf.files.colour import chromaticities_of, linear_spaces
 from usdbrdf.model.arrays import Double
 
-# The primaries' and the curve's names of the spaces that photographs have.
+# The primaries' and the curve's names of the spaces that photographs have, and those of light.
 _SPACES = {
     "srgb_rec709_scene": ("lin_rec709_scene", "srgb"),
     "srgb_p3d65_scene": ("lin_p3d65_scene", "srgb"),
     "g22_adobergb_scene": ("lin_adobergb_scene", "adobe"),
+    **{space: (space, "linear") for space in linear_spaces()},
 }
 # XYZ of the white of all profiles, D50, and Bradford's matrix, by which others come to it (ICC.1).
 _D50 = (0.9642, 1.0, 0.8249)
@@ -72,6 +73,8 @@ def _curve(tag: bytes) -> Double:
 
 
 def _known_curve(name: str) -> Double:
+    if name == "linear":
+        return _CODES
     if name == "adobe":
         return np.asarray(_CODES ** (563 / 256))
     return np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4)

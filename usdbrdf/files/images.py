@@ -32,6 +32,7 @@ from usdbrdf.files.exr_bytes import lists_its_chunks
 from usdbrdf.files.icc_profiles import space_of_profile
 from usdbrdf.files.jpeg_bytes import END, JPEG_SUFFIXES, jpeg_without_metadata, segments_of_jpeg
 from usdbrdf.files.paths import readable_size
+from usdbrdf.files.png_bytes import space_by_chunks
 from usdbrdf.files.radiance_header import primaries_of_hdr
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.model.arrays import Bool, Byte, Float
@@ -50,12 +51,10 @@ HALF_MAX = 65_504.0
 _HALF_FROM, _HALF_UNTIL = 2.0**-14, 60_000.0
 _PINNED_DATE = "2000:01:01 00:00:00"  # the date is all that would make two equal EXRs differ
 _FORMATS = ("openexr", "hdr", "tiff", "png", "jpeg")
-# fmt: off
 RAW_SUFFIXES = frozenset((
     ".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".nef", ".nrw", ".orf",
     ".pef", ".raf", ".raw", ".rw2", ".sr2", ".srf", ".srw", ".x3f",
-))
-# fmt: on
+))  # fmt: skip
 _CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 _FOR_A_HEADER = 16 << 20  # bytes
@@ -180,6 +179,7 @@ def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
     if profile is not None:
         known = space_of_profile(np.asarray(profile, np.uint8).tobytes())
         name = known or name or "an ICC profile without a name"
+    name = name or space_by_chunks(path)
     if source.format_name() in ("jpeg", "tiff"):
         name = name or space_by_exif(path, spec.getattribute("Exif:ColorSpace"))
     name, places = name or spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")

@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path, PurePosixPath
 
 _MAX_LENGTH = 64
+_MOST_ENDS = 16
 # Device names that Windows refuses as a file's stem, whatever the extension.
 _RESERVED = frozenset(
     ["aux", "con", "nul", "prn", *(f"{d}{i}" for d in ("com", "lpt") for i in range(10))]
@@ -58,6 +59,23 @@ def readable_label(label: str) -> str:
     """The label as USD can store it: control characters and lone surrogates become U+FFFD."""
     encodable = label.encode("utf-8", "replace").decode("utf-8")
     return "".join("\ufffd" if unicodedata.category(c) == "Cc" else c for c in encodable)
+
+
+def composed(name: str) -> str:
+    """A name with its accents as most programs write them; macOS hands them on as letters of their
+    own, which only look the same."""
+    return unicodedata.normalize("NFC", name)
+
+
+def ends_of(path: str) -> list[str]:
+    """The ends of a path that leads elsewhere, the longest first: of a capture that was moved, or
+    comes from another machine, one of them leads to the same file within it. None of a URI; and of
+    ../ not the name alone, which says too little where all the way to it is known."""
+    parts = [] if "://" in path else path.replace("\\", "/").split("/")
+    downwards = len(parts) - parts[::-1].index("..") if ".." in parts else 0
+    names = [name for name in parts[downwards:] if name.strip(".~") and name[-1] != ":"]
+    fewest = 2 if downwards else 1
+    return ["/".join(names[i:]) for i in range(len(names) - fewest + 1)[-_MOST_ENDS:]]
 
 
 def meant_by(

@@ -35,6 +35,14 @@ def files_of(path: Path, suffixes: Collection[str]) -> list[Path]:
     return [file for file in files if file.suffix.lower() in suffixes and file.is_file()]
 
 
+def only_one(found: Sequence[Path], path: Path, called: str, how: str) -> Path:
+    """The document of a capture; InputRefused, which says what such are ``called`` and ``how`` to
+    go on, where there are none or several."""
+    if len(found) != 1:
+        raise InputRefused(f"{path}: {len(found) or 'no'} {called}. {how}. [capture.format]")
+    return found[0]
+
+
 def beginning_of(path: Path, num_bytes: int = 2000) -> bytes:
     """A file's first bytes, for a glance at what it is; none where there is no file to read."""
     try:

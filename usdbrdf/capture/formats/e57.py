@@ -19,11 +19,11 @@ from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
-    mesh_beside,
     pictures_of,
     scan_of,
     warn_of_radiance,
 )
+from usdbrdf.capture.mesh_frames import mesh_beside
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import files_of
 from usdbrdf.model.arrays import Double

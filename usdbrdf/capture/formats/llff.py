@@ -17,13 +17,13 @@ from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.formats.named_pictures import (
     FOLDERS,
-    mesh_beside,
     pictures_of,
     refuse_without_pictures,
-    rigid_pose,
     scan_of,
     warn_of_radiance,
 )
+from usdbrdf.capture.mesh_frames import mesh_beside
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import read_array

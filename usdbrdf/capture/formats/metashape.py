@@ -18,19 +18,20 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.camera_checks import warn_of_rolling_shutter
 from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
-    mesh_beside,
     pictures_of,
     refuse_without_pictures,
-    rigid_pose,
     scan_of,
     warn_of_radiance,
     warn_of_unused,
 )
+from usdbrdf.capture.mesh_frames import mesh_beside
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.tables import (
@@ -39,6 +40,7 @@ from usdbrdf.files.tables import (
     files_of,
     number_in,
     numbers_of,
+    only_one,
     read_xml,
 )
 from usdbrdf.model.arrays import Double
@@ -68,14 +70,9 @@ def _documents(path: Path) -> list[Path]:
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:
-    documents = _documents(path.resolve())
-    if len(documents) != 1:
-        said = f"{len(documents)} exports of cameras" if documents else "no export of cameras"
-        raise InputRefused(
-            f"{path}: {said} (XML with sensors and cameras). Name the file, which File > Export > "
-            "Export Cameras writes. [capture.format]"
-        )
-    (source,) = documents
+    called = "exports of cameras (XML with sensors and cameras)"
+    how = "Name the file, which File > Export > Export Cameras writes"
+    source = only_one(_documents(path.resolve()), path, called, how)
     folder, findings = source.parent, Findings()
     pictures = pictures_of(folder, options)
     refuse_without_pictures(pictures, source)
@@ -132,6 +129,8 @@ def frame_records(
 ) -> list[FrameRecord]:
     """The cameras of a document that have a pose and a picture, by their labels."""
     chunk = _chunk(read_xml(source), source, findings)
+    if any(map(_moves_while_it_reads, chunk.iter())):
+        warn_of_rolling_shutter(source, findings)
     sensors = {s.get("id", ""): _sensor(s, source) for s in chunk.iterfind("sensors/sensor")}
     place_of = _places(chunk, source, findings)
     cameras = list(chunk.iterfind("cameras//camera"))
@@ -224,6 +223,15 @@ def _chunk(document: Element, source: Path, findings: Findings) -> Element:
 
 def _is_enabled(camera: Element) -> bool:
     return camera.get("enabled", "true").lower() not in ("false", "0")
+
+
+def _moves_while_it_reads(element: Element) -> bool:
+    """Whether an element is the motion that a rolling shutter was compensated for, of a camera or,
+    as what its sensor has, for all: of none numbers are 0, and words say so."""
+    if not element.tag.startswith("rolling_shutter"):
+        return False
+    said = " ".join([*element.itertext(), *element.attrib.values()]).lower().split()
+    return any(word not in ("false", "none", "disabled") and word.strip("0.e+-") for word in said)
 
 
 def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Element], _Place | None]:

@@ -5,14 +5,11 @@ from __future__ import annotations
 
 import math
 import os
-import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-
-import numpy as np
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
 from usdbrdf.capture.develop import with_rims
@@ -23,20 +20,15 @@ from usdbrdf.capture.parts import (
     radiance_encoding,
     scan_from_parts,
 )
-from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing, UsageError
+from usdbrdf.errors import ImageRefused, InputRefused, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
-from usdbrdf.files.naming import meant_by, must_be_undistorted, number_at_end
+from usdbrdf.files.naming import composed, ends_of, meant_by, must_be_undistorted, number_at_end
 from usdbrdf.files.paths import contained, seen_of
-from usdbrdf.files.tables import beginning_of
-from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
-from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.mesh_files import FileMesh
-from usdbrdf.untrusted.mesh_ply import LONGEST_HEADER, holds_points_alone
-from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 # In the order in which they are taken where one name has several: radiance first.
 SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
@@ -51,27 +43,20 @@ FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorte
 _OTHER_FOLDER = "Name the folder of the pictures with --frames, or name them relative to this one"
 _LETTERS: tuple[Callable[[str], str], ...] = (str, str.lower)  # in which names are compared
 _MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
-_MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
-_UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
 
 
 def path_in_capture(root: Path, candidate: str, options: CaptureOptions, *, cure: str = "") -> Path:
-    """The absolute path of ``candidate``; InputRefused if it leaves root and --allow-outside, which
-    says what to do by ``cure``, see ``contained``."""
-    for folder in options.allow_outside if candidate else ():
+    """The absolute path of ``candidate``, which may be absolute if it leads to what lies in root;
+    InputRefused if it leaves root and --allow-outside, which says what to do by ``cure``, see
+    ``contained``."""
+    homes = (root,) if PurePosixPath(candidate).is_absolute() else ()
+    for folder in (*homes, *options.allow_outside) if candidate else ():
         with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
             candidate.encode()
             path = (root / candidate).resolve()
             if path.is_relative_to(folder.resolve()):
                 return path
     return contained(root, candidate, cure=cure)
-
-
-def rigid_pose(rotation: Double, centre: Double) -> Double:
-    """(4, 4) of a 3 x 3 rotation and a point."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, centre
-    return pose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +76,7 @@ class Pictures:
         """The picture of this name: by its path below the folder, else by the end of its path, each
         in these letters, else in others, else by its name alone, with its suffix or another; of a
         photograph with radiance beside it that; None where there is none or several."""
-        written = PurePosixPath(_composed(label).replace("\\", "/").lstrip("./"))
+        written = PurePosixPath(composed(label).replace("\\", "/").lstrip("./"))
         known = (n for n in _names_without_suffix(written.name) if n.lower() in self._by_stem)
         if (stem := next(known, None)) is None:
             return None
@@ -126,7 +111,7 @@ class Pictures:
     def mask_of(self, picture: Path, folder: Path, options: CaptureOptions) -> Path | None:
         """``mask_beside`` of a picture, or of another of its name beside it, by its path below the
         pictures' folder, else by its name alone, where no other folder has a picture of it."""
-        stem = _composed(picture.stem)
+        stem = composed(picture.stem)
         alike = [path for path, p in self._by_stem[stem.lower()] if p.stem == stem]
         beside = [path for path in alike if path.parent == picture.parent]
         names = [path.relative_to(self.folder).as_posix() for path in beside]
@@ -139,7 +124,7 @@ class Pictures:
     def _by_stem(self) -> dict[str, list[tuple[Path, PurePosixPath]]]:
         by_stem: dict[str, list[tuple[Path, PurePosixPath]]] = {}
         for path in self.paths:
-            relative = PurePosixPath(_composed(path.relative_to(self.folder).as_posix()))
+            relative = PurePosixPath(composed(path.relative_to(self.folder).as_posix()))
             by_stem.setdefault(relative.stem.lower(), []).append((path, relative))
         return by_stem
 
@@ -158,12 +143,6 @@ class Pictures:
         for path in self.paths:
             found.setdefault(number_at_end(path.stem), []).insert(0, path)
         return {i: _nearest(alike)[0] for i, alike in sorted(found.items()) if i >= 0}
-
-
-def _composed(name: str) -> str:
-    """A name with its accents as most programs write them; macOS hands them on as letters of their
-    own, which only look the same."""
-    return unicodedata.normalize("NFC", name)
 
 
 def _nearness(path: Path) -> int:
@@ -255,29 +234,41 @@ class Pictured:
 
     otherwise  names of those that are not there, or not read here, and the files that were taken
     instead    of photographs that it names the radiance beside them, which was taken
+    moved      paths that lead out of the folder, and what was taken at their ends in it
     """
 
     folder: Path
     options: CaptureOptions
     otherwise: dict[str, Path] = field(default_factory=dict)
+    moved: dict[str, Path] = field(default_factory=dict)
     instead: dict[Path, Path] = field(default_factory=dict)
     _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
 
     def of(self, name: str, below: str = "") -> Path | None:
         """The picture called ``name`` in the folder ``below``: the file of this name, else the one
         there whose name differs in nothing but case and kind of picture, radiance first; of a
-        photograph that is there too, the radiance beside it, of HEIF any. Of ``--frames``, the
-        picture there that has its name. None where there is none. InputRefused for what leads out.
+        photograph that is there too, the radiance beside it, of HEIF any; of what leads out, as
+        from where the capture lay before, that at its end. Of ``--frames``, the picture there that
+        has its name. None where there is none. InputRefused for what leads out if all does.
         """
         if self.options.frames is not None:
             return self._of_frames.named(name)
         whole = f"{below}/{name}" if below else name
-        path = path_in_capture(self.folder, whole, self.options, cure=_OTHER_FOLDER)
-        if "\\" in name and not path.is_file():
-            whole = whole.replace("\\", "/")
+        try:
             path = path_in_capture(self.folder, whole, self.options, cure=_OTHER_FOLDER)
+            if "\\" in name and not path.is_file():
+                whole = whole.replace("\\", "/")
+                path = path_in_capture(self.folder, whole, self.options, cure=_OTHER_FOLDER)
+        except InputRefused:
+            found = self._at_end_of(whole, lambda path: self._picture(path, name))
+            if found is None and not self.moved:
+                raise
+            return found
+        return self._picture(path, name)
+
+    def _picture(self, path: Path, name: str) -> Path | None:
         beside = self._in_folder(path.parent)
-        names = _names_without_suffix(_composed(path.name).lower())
+        names = _names_without_suffix(composed(path.name).lower())
         alike = next((beside[stem] for stem in names if stem in beside), [])
         if path.is_file() and not (alike and path.suffix.lower() in _HEIF):
             return _or_radiance(path, alike, self.instead)
@@ -286,12 +277,38 @@ class Pictured:
             # Where some are of the kind that is named, what is of another may be their depths.
             alike = [one for one in alike if _kind_of_file(one) == kind or _is_radiance(one)]
         nearest = nearest_to_radiance(alike)
-        if nearest and _composed(path.name) not in map(_composed, (nearest.name, nearest.stem)):
+        if nearest and composed(path.name) not in map(composed, (nearest.name, nearest.stem)):
             self.otherwise[name] = nearest
         return nearest
 
+    def file(self, name: str) -> Path:
+        """Another file that the document names, which need not be there, with what leads out taken
+        alike."""
+        try:
+            return path_in_capture(self.folder, name, self.options)
+        except InputRefused:
+            if found := self._at_end_of(name, lambda path: path if path.is_file() else None):
+                return found
+            raise
+
+    def _at_end_of(self, path: str, look: Callable[[Path], Path | None]) -> Path | None:
+        """What one looks for at the first end of a path where it is, if that does not lead out."""
+        for end in ends_of(path):
+            with suppress(InputRefused):
+                if found := look(path_in_capture(self.folder, end, self.options)):
+                    self.moved[path] = found
+                    return found
+        return None
+
     def warn_of_others(self, findings: Findings, source: Path) -> None:
         """One sentence each where pictures were taken for others, and radiance for photographs."""
+        if self.moved:
+            name, path = next(iter(self.moved.items()))
+            findings.warn(
+                f"{source.name}: {len(self.moved)} of the files that it names lie elsewhere, as "
+                "before the capture was moved; those at the ends of their paths in this folder are "
+                f"taken, first {str(path)!r} for {name[:200]!r}. [capture.moved]"
+            )
         frames = self._of_frames.instead if self.options.frames is not None else {}
         warn_of_radiance(self.instead | frames, findings, source)
         if self.otherwise:
@@ -311,17 +328,17 @@ class Pictured:
             of_stem = self._listed[folder] = {}
             place = self._folder_called(folder)
             for path in _below(place, deep=False).paths if place.is_dir() else ():
-                of_stem.setdefault(_composed(path.stem).lower(), []).append(path)
+                of_stem.setdefault(composed(path.stem).lower(), []).append(path)
         return self._listed[folder]
 
     def _folder_called(self, folder: Path) -> Path:
         """A folder of the capture, else the only one there whose name differs in case alone."""
         if folder.is_dir() or not folder.is_relative_to(self.folder):
             return folder
-        above, name = self._folder_called(folder.parent), _composed(folder.name).lower()
+        above, name = self._folder_called(folder.parent), composed(folder.name).lower()
         there = above.iterdir() if above.is_dir() else ()
         # No links: they may lead out.
-        alike = [p for p in there if _composed(p.name).lower() == name and not p.is_symlink()]
+        alike = [p for p in there if composed(p.name).lower() == name and not p.is_symlink()]
         return alike[0] if len(alike) == 1 and alike[0].is_dir() else folder
 
 
@@ -364,28 +381,6 @@ def refuse_without_pictures(pictures: Pictures, source: Path) -> None:
             f"{source}: no pictures below {pictures.folder}. Put them beside it in a folder "
             "images, or name their folder with --frames. [capture.frames]"
         )
-
-
-def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) -> Path:
-    """``--mesh``, else the first of the ``usual`` files (patterns) that is there, else the one mesh
-    of the folder; MeshMissing, which says ``how`` to get one, where there is none."""
-    if options.mesh is not None:
-        return options.mesh
-    for pattern in usual:
-        found = [p for p in seen_of(folder.glob(pattern)) if p.suffix.lower() in _MESHES]
-        if found:
-            return contained(folder, found[0].relative_to(folder).as_posix())
-    there = [p for p in seen_of(folder.iterdir()) if p.suffix.lower() in _MESHES]
-    others = [p for p in there if not holds_points_alone(beginning_of(p, LONGEST_HEADER))]
-    if len(others) == 1:
-        return contained(folder, others[0].name)
-    unread = [p.name for p in seen_of(folder.iterdir()) if p.suffix.lower() in _UNREAD_MESHES]
-    said = f"{len(others)} meshes" if others else "no mesh"
-    if unread and not others:
-        said += f" that is read ({unread[0]} is none of {', '.join(_MESHES)})"
-    elif there and not others:
-        said += f" ({there[0].name} holds points alone)"
-    raise MeshMissing(f"{folder}: {said}. {how}, or name one with --mesh. [mesh.missing]")
 
 
 def scan_of(

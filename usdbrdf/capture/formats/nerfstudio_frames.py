@@ -12,6 +12,7 @@ order (nerf_loader.h, marching_cubes.cu).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath, PurePosixPath
@@ -22,9 +23,8 @@ import numpy as np
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO
 from usdbrdf.capture.formats.colmap import world_from_camera
-from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.mesh_frames import Lies, lies_with_points
-from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix
+from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix, rigid_pose
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.tables import beginning_of, numbers_among
@@ -51,6 +51,11 @@ _MODELS = ("colmap_sparse/0", "colmap_text", "colmap/sparse/0", "sparse/0", "spa
 # less than the rounding of who writes few digits is no other frame.
 _SAME_CAMERA, _SAME_FRAME = 1e-2, 1e-4
 _LARGEST = 1e9  # number that makes sense in a matrix
+# Keys that state the axes of cameras, not of the world, and what they say.
+_CONVENTION = re.compile(r"(?i)^(?!.*world).*(convention|coordinate_?(system|frame)|camera_axes)")
+_AXES = dict.fromkeys(("opencv", "opencvc2w", "colmap", "rdf"), "OpenCV") | dict.fromkeys(
+    ("opengl", "openglc2w", "blender", "nerf", "nerfstudio", "instantngp", "rub"), "OpenGL"
+)
 # By which instant-ngp's meshes are known, PLY and OBJ; what it takes where a document says nothing.
 _OF_NGP = (b"output from https://github.com/NVlabs/instant-ngp", b"mtllib nerf.mtl")
 _NGP_SCALE, _NGP_OFFSET = 0.33, 0.5
@@ -115,8 +120,48 @@ def rolling_shutter(holder: Mapping[str, Any]) -> list[Any]:
 
 def camera_axes(document: Mapping[str, Any]) -> Double:
     """(4, 4) by which the document's cameras become OpenGL's: those that instant-ngp knows as
-    Mitsuba's have x to the left and look down +z (nerf_matrix_to_ngp)."""
-    return np.diag([-1.0, 1, -1, 1]) if _is_mitsubas(document) else np.eye(4)
+    Mitsuba's have x to the left and look down +z (nerf_matrix_to_ngp); others may be stated."""
+    if _is_mitsubas(document):
+        return np.diag([-1.0, 1, -1, 1])
+    stated = {_AXES.get(_plain(word)) for word in stated_conventions(document).values()}
+    return np.diag([1.0, -1, -1, 1]) if "OpenCV" in stated else np.eye(4)
+
+
+def stated_conventions(document: Mapping[str, Any]) -> dict[str, str]:
+    """What a document says of its cameras' axes, by the keys under which it does: camera_convention
+    is MapAnything's (WAI), and always "opencv"; the others people make up."""
+    words = ((key, value) for key, value in document.items() if _CONVENTION.search(key))
+    return {key: value for key, value in words if isinstance(value, str)}
+
+
+def warn_of_conventions(document: Mapping[str, Any], source: Path, findings: Findings) -> None:
+    """One sentence on axes that a document states, if they are not OpenGL's; InputRefused where it
+    states two."""
+    stated = stated_conventions(document)
+    known = {key: axes for key, word in stated.items() if (axes := _AXES.get(_plain(word)))}
+    if len(set(known.values())) > 1:
+        said = ", ".join(f"{key} {stated[key][:40]!r}" for key in known)
+        raise InputRefused(
+            f"{source}: states two conventions of its cameras, {said}. Keep the one that its poses "
+            "have. [capture.convention]"
+        )
+    for key, word in stated.items():
+        if known.get(key) == "OpenCV":
+            findings.warn(
+                f"{source.name}: {key} is {word!r}, so its cameras are read as such that look down "
+                "+z with y down. [capture.convention]"
+            )
+        elif key not in known:
+            findings.warn(
+                f"{source.name}: {key} is {word[:40]!r}, which is not known here; its cameras are "
+                "read as OpenGL's, from camera to world. If they are not, convert them, or state "
+                "camera_convention opencv. [capture.convention]"
+            )
+
+
+def _plain(word: str) -> str:
+    """Letters and digits alone, small."""
+    return re.sub(r"[\W_]", "", word.lower())
 
 
 def _is_mitsubas(document: Mapping[str, Any]) -> bool:
@@ -363,7 +408,8 @@ def has_old_axes(
     tested = TESTED in document
     if "applied_transform" in document or not (beside or tested or in_scene):
         return False
-    known = _old_axes_by_model(source.parent / _COLMAP, frames) if beside else in_scene or None
+    axes, model = camera_axes(document), source.parent / _COLMAP
+    known = _old_axes_by_model(model, frames, axes) if beside else in_scene or None
     if known is False:
         return False
     if beside:
@@ -385,7 +431,9 @@ def has_old_axes(
     return True
 
 
-def _old_axes_by_model(model: Path, frames: Sequence[Mapping[str, Any]]) -> bool | None:
+def _old_axes_by_model(
+    model: Path, frames: Sequence[Mapping[str, Any]], axes: Double
+) -> bool | None:
     """Whether a document's poses are those of this model of COLMAP with the axes that nerfstudio
     gave them before 2023; None where the model does not tell, as it cannot be read or has not the
     same cameras."""
@@ -402,7 +450,7 @@ def _old_axes_by_model(model: Path, frames: Sequence[Mapping[str, Any]]) -> bool
         k = _longest_end(PurePosixPath(name), theirs) if isinstance(name, str) else None
         if pose is not None and k is not None:
             start = world_from_camera(found.camera_from_world[k])
-            old, same = OLD_NERFSTUDIO @ start, start
+            pose, old, same = pose @ axes, OLD_NERFSTUDIO @ start, start
             off.append((np.abs(old - pose)[:3, :3].max(), np.abs(same - pose)[:3, :3].max()))
     if len(off) < max(3, len(frames) / 2):
         return None

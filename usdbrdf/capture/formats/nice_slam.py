@@ -15,12 +15,12 @@ from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
-    mesh_beside,
     pictures_of,
     refuse_without_pictures,
     scan_of,
 )
 from usdbrdf.capture.formats.replica_semantics import semantic_files, semantics_beside
+from usdbrdf.capture.mesh_frames import mesh_beside
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.tables import number_rows

@@ -26,14 +26,14 @@ from usdbrdf.capture.formats.named_pictures import (
     FOLDERS,
     Pictures,
     drop_without_picture,
-    mesh_beside,
     pictures_of,
     refuse_without_pictures,
-    rigid_pose,
     scan_of,
     warn_of_radiance,
     warn_of_unused,
 )
+from usdbrdf.capture.mesh_frames import mesh_beside
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
 from usdbrdf.files.paths import seen_of

@@ -18,13 +18,13 @@ from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
-    mesh_beside,
     pictures_of,
     refuse_without_pictures,
     scan_of,
     warn_of_unused,
 )
 from usdbrdf.capture.formats.scannet_objects import annotated_objects
+from usdbrdf.capture.mesh_frames import mesh_beside
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_text
 from usdbrdf.files.images import image_size

@@ -17,7 +17,6 @@ from usdbrdf.capture.formats.colmap import lens_of, world_from_camera
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
-    mesh_beside,
     pictures_of,
     refuse_without_pictures,
     scan_of,
@@ -26,6 +25,7 @@ from usdbrdf.capture.formats.named_pictures import (
 from usdbrdf.capture.formats.nerfstudio_frames import TESTED, is_bad, warn_of_bad
 from usdbrdf.capture.formats.scannet_objects import annotated_objects
 from usdbrdf.capture.formats.transforms import records_of_scene
+from usdbrdf.capture.mesh_frames import mesh_beside
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.capture import Scan

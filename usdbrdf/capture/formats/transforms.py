@@ -12,9 +12,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.camera_checks import warn_of_rolling_shutter
 from usdbrdf.capture.checks import Findings, FrameRecord, at_image_size, clause_of
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO
-from usdbrdf.capture.formats.named_pictures import Pictured, mesh_beside, path_in_capture, scan_of
+from usdbrdf.capture.formats.named_pictures import Pictured, scan_of
 from usdbrdf.capture.formats.nerfstudio_frames import (
     EXPORTED,
     TESTED,
@@ -28,8 +29,9 @@ from usdbrdf.capture.formats.nerfstudio_frames import (
     stated_pose,
     statements_beside,
     warn_of_bad,
+    warn_of_conventions,
 )
-from usdbrdf.capture.mesh_frames import scene_above
+from usdbrdf.capture.mesh_frames import mesh_beside, scene_above
 from usdbrdf.capture.nerfstudio_lens import lens_of_frame
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.rigid_poses import is_camera_matrix
@@ -53,17 +55,25 @@ _LARGEST = 1e15
 # Where no size is stated: a principal point this far from the image's centre, or an image this much
 # wider than its angle says, in parts of its size, belongs to an image of another size.
 _OFF_CENTRE = 0.2
+# What the document is called, the second by MapAnything (WAI).
+_DOCUMENTS = ("transforms.json", "scene_meta.json")
 beside_mesh = statements_beside
 
 
 def matches(path: Path) -> bool:
     """A folder with transforms.json, or such a document itself."""
-    return (path / "transforms.json").is_file() or (path.suffix == ".json" and path.is_file())
+    document = _document(path)
+    return document.suffix == ".json" and document.is_file()
+
+
+def _document(path: Path) -> Path:
+    inside = [path / name for name in _DOCUMENTS] if path.is_dir() else [path]
+    return next((file for file in inside if file.is_file()), inside[0])
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     path = path.resolve()
-    source = path / "transforms.json" if path.is_dir() else path
+    source = _document(path)
     findings = Findings()
     capture, records = _captured(source, options, findings)
     up_axis = _stated(capture, "up_axis", get_args(UpAxis))
@@ -94,6 +104,11 @@ def _geometry(capture: _Capture, findings: Findings) -> ScanGeometry:
     """Of the mesh that the document names, else mesh.ply beside it, else the only one there."""
     options, root = capture.options, capture.source.parent
     mesh = options.mesh or _beside(capture, "mesh", "mesh.ply")
+    if capture.document.get("mesh") in capture.pictured.moved and options.mesh is None:
+        findings.warn(
+            f"{capture.source.name}: its mesh lies elsewhere, as before the capture was moved; "
+            f"{str(mesh)!r} is taken. [capture.moved]"
+        )
     if "mesh" not in capture.document and not mesh.is_file():
         how = "Put mesh.ply beside the poses"
         mesh = mesh_beside(root, options, "mesh.*", *EXPORTED, how=how)
@@ -260,11 +275,9 @@ def _captured(
         masks=images and not in_scene,
         is_legacy=has_old_axes(source, document, frames, findings, in_scene=in_scene),
     )
+    warn_of_conventions(document, source, findings)
     if any(any(rolling_shutter(frame)) for frame in (document, *frames)):
-        findings.warn(
-            f"{source.name}: states a rolling_shutter, which is not undone: what a camera took "
-            "while it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
-        )
+        warn_of_rolling_shutter(source, findings)
     sound = [(i, frame) for i, frame in enumerate(frames) if not is_bad(frame)]
     warn_of_bad(len(frames) - len(sound), len(frames), source.name, findings)
     records = [r for i, frame in sound if (r := _record(capture, frame, i, findings))]
@@ -435,7 +448,7 @@ def _mask(capture: _Capture, frame: Mapping[str, Any], name: str) -> Path | None
             "it has none.",
             "capture.mask",
         )
-    return path_in_capture(capture.source.parent, mask, capture.options)
+    return capture.pictured.file(mask)
 
 
 def _beside(capture: _Capture, key: str, usual: str) -> Path:
@@ -443,7 +456,7 @@ def _beside(capture: _Capture, key: str, usual: str) -> Path:
     name = capture.document.get(key, usual)
     if not isinstance(name, str):
         raise capture.refuse(f"{key} is not a file name. Correct it.", "capture.format")
-    return path_in_capture(capture.source.parent, name, capture.options)
+    return capture.pictured.file(name)
 
 
 def _stated(capture: _Capture, key: str, known: tuple[str, ...]) -> str | None:

@@ -27,7 +27,7 @@ from usdbrdf.capture.reconstructions.shots import (
 )
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.paths import seen_of
-from usdbrdf.files.tables import files_of, number_in, number_rows
+from usdbrdf.files.tables import files_of, number_in, number_rows, only_one
 from usdbrdf.model.arrays import Bool, Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.options import CaptureOptions
@@ -69,12 +69,7 @@ def _home(path: Path) -> Path:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     found, findings, folder = _trajectories(path.resolve()), Findings(), _home(path)
-    if len(found) != 1:
-        raise InputRefused(
-            f"{path}: {len(found) or 'no'} {_TRAJECTORY}. Name the folder of one video. "
-            "[capture.format]"
-        )
-    (source,) = found
+    source = only_one(found, path, _TRAJECTORY, "Name the folder of one video")
     return scan_of_shots(
         shots_of(source, options, findings),
         options,

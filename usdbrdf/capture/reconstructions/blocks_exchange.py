@@ -18,11 +18,18 @@ from scipy.spatial.transform import Rotation
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, scan_of_shots
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused, MeshMissing
 from usdbrdf.files.paths import seen_of
-from usdbrdf.files.tables import Element, beginning_of_text, files_of, numbers_of, read_xml
+from usdbrdf.files.tables import (
+    Element,
+    beginning_of_text,
+    files_of,
+    numbers_of,
+    only_one,
+    read_xml,
+)
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens, fisheye_of_turn, is_fisheye_of_turn, whole_sphere
@@ -69,13 +76,8 @@ def _documents(path: Path) -> list[Path]:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
-    if len(documents) != 1:
-        said = f"{len(documents) or 'no'} documents of BlocksExchange XML"
-        raise InputRefused(
-            f"{path}: {said}. Name the file that was exported of the aerotriangulation. "
-            "[capture.format]"
-        )
-    (source,) = documents
+    how = "Name the file that was exported of the aerotriangulation"
+    source = only_one(documents, path, "documents of BlocksExchange XML", how)
     root = read_xml(source)
     block = _block(root, source, findings)
     system = _system(root, block, source)

@@ -14,7 +14,6 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import (
     CentredCamera,
     Shot,
@@ -22,6 +21,7 @@ from usdbrdf.capture.reconstructions.shots import (
     files_of_capture,
     scan_of_shots,
 )
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
 from usdbrdf.files.paths import seen_of

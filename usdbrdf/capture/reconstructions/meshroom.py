@@ -17,7 +17,6 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import (
     Shot,
     ShotCamera,
@@ -26,6 +25,7 @@ from usdbrdf.capture.reconstructions.shots import (
     scan_of_shots,
     size_in,
 )
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.paths import seen_of

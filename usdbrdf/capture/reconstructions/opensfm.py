@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import (
     Shot,
     ShotCamera,
@@ -22,6 +21,7 @@ from usdbrdf.capture.reconstructions.shots import (
     scan_of_shots,
     size_in,
 )
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.tables import numbers_among

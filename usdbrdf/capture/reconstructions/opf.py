@@ -16,13 +16,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.camera_checks import warn_of_rolling_shutter
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.conventions import opengl_from_opencv
-from usdbrdf.capture.formats.named_pictures import path_in_capture, rigid_pose
+from usdbrdf.capture.formats.named_pictures import path_in_capture
 from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, rows_of, scan_of_shots
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
-from usdbrdf.files.tables import beginning_of, files_of, number_in, numbers_among
+from usdbrdf.files.tables import beginning_of, files_of, number_in, numbers_among, only_one
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens, fisheye_of_turn, is_fisheye_of_turn, whole_sphere
@@ -51,10 +53,7 @@ def _documents(path: Path) -> list[Path]:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
-    if len(documents) != 1:
-        said = f"{len(documents) or 'no'} projects .opf"
-        raise InputRefused(f"{path}: {said}. Name the one of the calibration. [capture.format]")
-    (source,) = documents
+    source = only_one(documents, path, "projects .opf", "Name the one of the calibration")
     lists, sensors, cameras, frames = (
         _resources(source, kind, options) for kind in (_PICTURES, _SENSORS, _CAMERAS, _FRAME)
     )
@@ -69,10 +68,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         )
     moved = (numbers_among(row.get("rolling_shutter"), 3) for row in rows_of(cameras[0], "cameras"))
     if any(numbers is not None and numbers.any() for numbers in moved):
-        findings.warn(
-            f"{source.name}: states a rolling_shutter, which is not undone: what a camera took "
-            "while it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
-        )
+        warn_of_rolling_shutter(source, findings)
     systems = [_system(frame) for frame in frames]
     if options.meters_per_unit is None and not all(map(_in_metres, systems)):
         findings.warn(

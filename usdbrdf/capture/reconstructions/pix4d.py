@@ -14,7 +14,6 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import (
     Shot,
     ShotCamera,
@@ -22,9 +21,10 @@ from usdbrdf.capture.reconstructions.shots import (
     files_of_capture,
     scan_of_shots,
 )
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
-from usdbrdf.files.tables import beginning_of, files_of, numbers_among
+from usdbrdf.files.tables import beginning_of, files_of, numbers_among, only_one
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens
 from usdbrdf.options import CaptureOptions
@@ -54,12 +54,8 @@ def _documents(path: Path) -> list[Path]:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
-    if len(documents) != 1:
-        said = f"{len(documents) or 'no'} files calibrated_camera_parameters.txt"
-        raise InputRefused(
-            f"{path}: {said}. Name the one in {_PLACE} of the project. [capture.format]"
-        )
-    (source,) = documents
+    called = "files calibrated_camera_parameters.txt"
+    source = only_one(documents, path, called, f"Name the one in {_PLACE} of the project")
     return scan_of_shots(
         shots_of(source),
         options,

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.named_pictures import rigid_pose
 from usdbrdf.capture.reconstructions.shots import CentredCamera, Shot, scan_of_shots
+from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
-from usdbrdf.files.tables import beginning_of, files_of, numbers_among
+from usdbrdf.files.tables import beginning_of, files_of, numbers_among, only_one
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens
 from usdbrdf.options import CaptureOptions
@@ -42,10 +42,8 @@ def _documents(path: Path) -> list[Path]:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     documents, findings = _documents(path.resolve()), Findings()
-    if len(documents) != 1:
-        said = f"{len(documents) or 'no'} files .nvm that begin with NVM_V3"
-        raise InputRefused(f"{path}: {said}. Name the one that was exported. [capture.format]")
-    (source,) = documents
+    called = "files .nvm that begin with NVM_V3"
+    source = only_one(documents, path, called, "Name the one that was exported")
     return scan_of_shots(
         shots_of(source, findings),
         options,
