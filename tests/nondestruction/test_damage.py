@@ -54,6 +54,22 @@ def test_a_damaged_root_is_made_again_once_it_is_removed(capture, converted, cop
     assert bytes_of(copied) == bytes_of(converted.folder)
 
 
+@pytest.mark.parametrize("rest", [b"#usda 1.0\n", b"#usda 1.0", b"", bytes(512)])
+def test_a_root_of_which_no_more_than_its_first_line_is_left_is_written_again(
+    capture, converted, copied, capsys, rest
+):
+    """Nobody's work is in it, and USD takes it for a stage: nothing else would be told."""
+    (copied / "room.usda").write_bytes(rest)
+    command = ["convert", str(capture), "-o", str(copied), *COARSE]
+    assert main(command) == 0
+    assert "room.usda: cut off; it is written again" in capsys.readouterr().err
+    assert bytes_of(copied) == bytes_of(converted.folder)
+    theirs = "#usda 1.0\n# the artist's\n"
+    (copied / "room.usda").write_text(theirs)
+    assert main(command) == 0
+    assert (copied / "room.usda").read_text() == theirs
+
+
 def test_a_damaged_scan_is_made_again_with_other_options(capture, converted, copied):
     cut(copied / "layers/scan.usdc")
     convert(capture, copied, "--crease-angle", "60")
