@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, ParamSpec
 
 from usdbrdf.asset.adopt import adopt, is_damaged
+from usdbrdf.asset.layers.interface import mend_root
 from usdbrdf.asset.layers.scan_layer import is_edited
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import warn_of_edits
@@ -124,6 +125,9 @@ def working_on(
         damaged = [file for file in changed if is_damaged(asset.folder / file)]
         for file in damaged:
             warn(f"{asset.folder / file}: damaged; it is made again. [layer.damaged]")
+        with environment_failures(str(asset.root_layer)):
+            if mend_root(asset):
+                warn(f"{asset.root_layer}: cut off; it is written again. [layer.damaged]")
         edited = [file for file in changed if file not in damaged]
         if edited and hand_edits == "refuse":
             raise OwnershipConflict(

@@ -16,6 +16,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.fault_injection import VARIABLE, Fault
@@ -24,6 +25,7 @@ from usdbrdf.files import atomic
 from usdbrdf.files.atomic import (
     environment_failures,
     failure_of_machine,
+    flush_file,
     flush_folder,
     publish,
     raise_shortage,
@@ -33,6 +35,7 @@ from usdbrdf.files.atomic import (
     whole_folder,
     write_text_atomic,
 )
+from usdbrdf.files.documents import save_arrays
 from usdbrdf.files.scratch import PREFIX, scratch_folder
 
 ROOT = Path(__file__).parents[2]
@@ -315,9 +318,29 @@ except EnvironmentFailure as error:
     path = tmp_path / "a.txt"
     path.write_text("old")
     said = run_python(code, path).stdout
-    assert said.startswith("stamp: ")
+    assert said.startswith(f"stamp: File too large ('{path}'). ")
     assert said.endswith("[environment.io]\n")
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.txt", "old")]
+
+
+@pytest.mark.fault("R1")
+def test_an_error_of_an_open_file_names_it(tmp_path, monkeypatch):
+    """The system tells no name with what it says at a write, a flush, or as late as at closing,
+    where a disk of the network may be full."""
+    with (
+        pytest.raises(EnvironmentFailure, match=r"^shade: No space left .+ \('/dev/full'\)\. "),
+        environment_failures("shade"),
+    ):
+        save_arrays(Path("/dev/full"), {"a": np.zeros(3)})
+    (tmp_path / "a.json").write_text("{}")
+
+    def fails(_descriptor):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fsync", fails)
+    for flush, place in ((flush_file, tmp_path / "a.json"), (flush_folder, tmp_path)):
+        with pytest.raises(OSError, match=f"Input/output error: '{place}'$"):
+            flush(place)
 
 
 def test_errors_of_the_machine_are_translated():

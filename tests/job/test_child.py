@@ -22,7 +22,7 @@ from usdbrdf.job import child as module
 from usdbrdf.job.child import run_child
 
 CHILDREN = """
-import os, signal, sys, tempfile, time
+import os, resource, signal, sys, tempfile, time
 import numpy as np
 from usdbrdf.errors import InputRefused, UsageError
 
@@ -53,6 +53,11 @@ def note(arrays, parameters):
 def spin(arrays, parameters):
     while True:
         pass
+
+def fill_disk(arrays, parameters):
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    return {"a": np.zeros(9)}
 
 def leave(arrays, parameters):
     print("no memory for a thread", file=sys.stderr, flush=True)
@@ -143,6 +148,15 @@ def test_a_child_that_cannot_start_is_the_environment(child):
         child("leave")
     with pytest.raises(EnvironmentFailure, match=r"missing_library.+\[child\.start\]$"):
         child("imports")
+
+
+@pytest.mark.fault("R1")
+def test_a_child_whose_disk_is_full_says_which(child, tmp_path, monkeypatch):
+    """Not even what is wrong can be left there: it was told as one that could not be started."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    expected = rf"^unwrap of <chair>: .+ written into {tmp_path}, .+TMPDIR.+\[environment\.io\]$"
+    with pytest.raises(EnvironmentFailure, match=expected):
+        child("fill_disk")
 
 
 def test_hang_is_stopped_with_all_that_it_started(child, tmp_path, monkeypatch):

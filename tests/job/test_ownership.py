@@ -19,7 +19,7 @@ import pytest
 
 from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, OwnershipConflict
 from usdbrdf.files.atomic import TEMPORARY_PREFIX
-from usdbrdf.job.ownership import edited_files, owned_folder, writing_alone
+from usdbrdf.job.ownership import edited_files, owned_folder, reading, writing_alone
 
 
 def own(asset):
@@ -352,3 +352,51 @@ def test_links_within_the_asset_and_of_the_asset_are_followed(tmp_path, toy):
 def test_a_folder_that_is_gone_is_the_machine_s_and_no_defect(tmp_path):
     with pytest.raises(EnvironmentFailure, match="gone"), writing_alone(tmp_path / "gone"):
         pass
+
+
+def test_an_asset_that_lost_the_record_of_its_maker_is_known_by_its_steps(tmp_path, toy):
+    toy.run_toy(tmp_path / "room")
+    before = names_in(tmp_path / "room")
+    (tmp_path / "room/.usdbrdf/job.json").unlink()
+    assert toy.run_toy(tmp_path / "room").reran is False
+    assert names_in(tmp_path / "room") == before
+    # Anybody may call a folder so.
+    shutil.rmtree(tmp_path / "room/.usdbrdf")
+    (tmp_path / "room/.usdbrdf/stamps").mkdir(parents=True)
+    (tmp_path / "room/.usdbrdf/stamps/1-toy.json").write_text("{}")
+    with pytest.raises(OwnershipConflict, match=r"hidden folder \.usdbrdf.+\[ownership.foreign\]"):
+        own(tmp_path / "room")
+
+
+@pytest.mark.parametrize("name", ["lock", "job.json", "stamps", "work", "cache"])
+def test_what_lies_in_the_place_of_our_state_is_named(tmp_path, toy, name):
+    toy.run_toy(tmp_path / "room")
+    place = tmp_path / "room/.usdbrdf" / name
+    if place.is_dir():
+        shutil.rmtree(place)
+        place.touch()
+        found = "no folder, and a folder"
+    else:
+        place.unlink()
+        place.mkdir()
+        found = "a folder, and a file"
+    if name == "stamps":
+        (tmp_path / "room/holiday.jpg").touch()
+    with pytest.raises(OwnershipConflict, match=rf"{place}: this is {found} .+ownership.place"):
+        own(tmp_path / "room")
+
+
+def test_a_pipe_or_a_link_for_a_lock_is_named_and_nobody_waits_for_it(tmp_path, toy):
+    toy.run_toy(tmp_path / "room")
+    lock = tmp_path / "room/.usdbrdf/lock"
+    lock.unlink()
+    os.mkfifo(lock)
+    with pytest.raises(OwnershipConflict, match=rf"^{lock}: this is .+ a pipe .+ownership.place"):
+        own(tmp_path / "room")
+    with reading(tmp_path / "room"):
+        pass
+    lock.unlink()
+    lock.symlink_to("job.json")
+    with pytest.raises(OwnershipConflict, match=rf"^{lock}: this is a link, .+ownership.place"):
+        own(tmp_path / "room")
+    assert json.loads((lock.parent / "job.json").read_text())["tool"] == "usdbrdf"

@@ -8,6 +8,7 @@ import shutil
 import pytest
 
 from tests.nondestruction.conftest import COARSE, bytes_of, convert
+from usdbrdf.asset.layers.interface import mend_root
 from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
 
@@ -51,6 +52,26 @@ def test_a_damaged_root_is_made_again_once_it_is_removed(capture, converted, cop
         assert f"{root}: this is not a readable USD layer. Correct it, or remove it and run" in said
     root.unlink()
     convert(capture, copied)
+    assert bytes_of(copied) == bytes_of(converted.folder)
+
+
+def test_a_root_of_which_no_more_than_its_first_line_is_left_is_written_again(
+    capture, converted, copied, capsys
+):
+    """Nobody's work is in it, and USD takes it for a stage: nothing else would be told."""
+    root, whole = copied / "room.usda", (converted.folder / "room.usda").read_bytes()
+    for rest in (b"#usda 1.0\n", b"#usda 1.0", b"", bytes(512)):
+        root.write_bytes(rest)
+        assert mend_root(Asset.at(copied))
+        assert root.read_bytes() == whole
+    theirs = b"#usda 1.0\n# the artist's\n"
+    root.write_bytes(theirs)
+    assert not mend_root(Asset.at(copied))
+    assert root.read_bytes() == theirs
+    root.write_bytes(whole[:10])
+    loud = [option for option in COARSE if option != "-q"]
+    assert main(["convert", str(capture), "-o", str(copied), *loud]) == 0
+    assert "room.usda: cut off; it is written again" in capsys.readouterr().err
     assert bytes_of(copied) == bytes_of(converted.folder)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.errors import EnvironmentFailure
-from usdbrdf.files.atomic import sha256_of, temporary_beside
+from usdbrdf.files.atomic import naming, sha256_of, temporary_beside
 from usdbrdf.files.documents import load_arrays, save_arrays
 from usdbrdf.model.arrays import Array
 
@@ -169,7 +169,7 @@ class Store:
             digest.update(part)
 
         def write(path: Path) -> None:
-            with path.open("wb") as file:
+            with naming(path), path.open("wb") as file:
                 for part in parts:
                     file.write(part)
 

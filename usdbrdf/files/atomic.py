@@ -78,20 +78,21 @@ def move(staged: Path, final: Path) -> None:
 
 def flush_file(file: Path) -> None:
     """A file's bytes reach the disk; its name may not yet."""
-    with file.open("rb") as written:
+    with naming(file), file.open("rb") as written:
         os.fsync(written.fileno())
 
 
 def flush_folder(folder: Path) -> None:
     """The names in a folder reach the disk."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    except OSError as error:  # network file systems that cannot flush a folder say EINVAL
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
-            raise
-    finally:
-        os.close(descriptor)
+    with naming(folder):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        except OSError as error:  # network file systems that cannot flush a folder say EINVAL
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+                raise
+        finally:
+            os.close(descriptor)
 
 
 def make_folders(folder: Path) -> None:
@@ -123,7 +124,7 @@ def is_bare(folder: Path) -> bool:
 def sha256_of(path: Path) -> str:
     """Hexadecimal SHA-256 of a file's bytes."""
     digest = hashlib.sha256()
-    with path.open("rb") as file:
+    with naming(path), path.open("rb") as file:
         while block := file.read(_BLOCK):
             digest.update(block)
     return digest.hexdigest()
@@ -132,7 +133,8 @@ def sha256_of(path: Path) -> str:
 def write_text_atomic(path: Path, text: str) -> None:
     """Write UTF-8 text; ``path`` holds either its previous content or all of the new one."""
     with temporary_beside(path) as staged:
-        staged.write_bytes(text.encode("utf-8"))
+        with naming(path):
+            staged.write_bytes(text.encode("utf-8"))
         publish(staged, path)
 
 
@@ -246,6 +248,18 @@ def whole_folder(final: Path) -> Iterator[Path]:
     with temporary_folder(final) as staged:
         yield staged
         publish_folder(staged, final.resolve())
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors of the system name the file that was in work: of one that is open, at its reading,
+    writing, flushing and closing, it tells none."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            error.filename = str(path)
+        raise
 
 
 @contextmanager

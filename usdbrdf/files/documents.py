@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.errors import InputRefused, UsdBrdfError
-from usdbrdf.files.atomic import raise_shortage, write_text_atomic
+from usdbrdf.files.atomic import naming, raise_shortage, write_text_atomic
 from usdbrdf.files.paths import why_not_fetched
 from usdbrdf.model.arrays import Array
 
@@ -231,7 +231,11 @@ def _plain(value: object) -> object:
 
 def save_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
     """Write arrays; object arrays raise ValueError. (np.savez would not take the key "file".)"""
-    with path.open("wb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+    with (
+        naming(path),
+        path.open("wb") as file,
+        zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive,
+    ):
         for key, array in arrays.items():
             member = zipfile.ZipInfo(f"{key}.npy")  # its date is 1980, so equal arrays, equal bytes
             with archive.open(member, "w", force_zip64=True) as stream:

@@ -68,6 +68,26 @@ def inside(root: Path, place: Path) -> Path:
     return place
 
 
+def refuse_misplaced(root: Path, files: Iterable[Path]) -> None:
+    """OwnershipConflict where a folder lies in the place of a file of ours below ``root``, or a
+    file in that of a folder: putting files in place would stop there each time, with some of them
+    of another run."""
+    for file in files:
+        above = [folder for folder in file.parents if folder.is_relative_to(root)]
+        wrong = [file] if file.is_dir() else [f for f in above if f.exists() and not f.is_dir()]
+        for place in wrong:
+            found, wanted = ("a folder", "file") if place == file else ("no folder", "folder")
+            raise misplaced(place, found, wanted)
+
+
+def misplaced(place: Path, found: str, wanted: str = "file") -> OwnershipConflict:
+    """What to say of something that lies in the place of a file, or a folder, of ours."""
+    return OwnershipConflict(
+        f"{place}: this is {found}, and a {wanted} of usdbrdf's is to be here. Move it away and "
+        "run the same command again. [ownership.place]"
+    )
+
+
 def refuse_nameless(path: Path | None) -> None:
     """InputRefused where the absolute path is not UTF-8, as every path in a layer of USD is."""
     try:

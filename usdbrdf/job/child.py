@@ -35,7 +35,8 @@ from usdbrdf.model.arrays import Array
 _START = "from usdbrdf.job.child import main; main()"
 # BLAS's threads would only wait for each other, and each takes addresses, which may be limited.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-_ERROR_TOLD = 97  # exit status of a child that left an error.json
+# Exit statuses of a child that left an error.json, and of one for which its disk had no room.
+_ERROR_TOLD, _ERROR_UNTOLD = 97, 98
 _GRACE_SECONDS = 10  # the child's own alarm, should we die before we can end it
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _ERROR_CLASSES = {
@@ -159,6 +160,12 @@ def _crash(status: int, folder: Path, label: str) -> UsdBrdfError:
             f"{label} was killed from outside or out of memory.{said} Use a machine with more, or "
             "a smaller input. [child.killed]"
         )
+    if status == _ERROR_UNTOLD:
+        return EnvironmentFailure(
+            f"{label}: nothing can be written into {folder.parent}, the folder of temporary "
+            "files. Free disk space there, or name another folder (TMPDIR), then run the same "
+            "command again; finished work is kept. [environment.io]"
+        )
     if status > 0:  # the child tells every error of its function: it did not come as far
         return EnvironmentFailure(
             f"{label} could not be started (exit status {status}).{said} Check the installation "
@@ -207,7 +214,10 @@ def main() -> None:
                 "(ulimit -a). [child.start]"
             )
         told = {"class": name, "message": message, "traceback": traceback.format_exc()}
-        (folder / "error.json").write_text(json.dumps(told), "utf-8")
+        try:
+            (folder / "error.json").write_text(json.dumps(told), "utf-8")
+        except OSError:
+            _leave(_ERROR_UNTOLD)
         _leave(_ERROR_TOLD)
     _leave(0)
 

@@ -8,6 +8,7 @@ import fcntl
 import os
 import shutil
 import socket
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +23,7 @@ from typing import ParamSpec, TypeVar
 from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, NoLocks, OwnershipConflict
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, flush_folder, sha256_of
 from usdbrdf.files.documents import read_json, write_json
-from usdbrdf.files.paths import inside
+from usdbrdf.files.paths import inside, misplaced, refuse_misplaced
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 
 _POLL_SECONDS = 0.2
@@ -68,7 +69,8 @@ def folder_lock(
     without_lock  go on where the file system has no locks, which is FolderBusy otherwise
 
     The file stays and means nothing by itself; nobody ever has to delete it. FileNotFoundError: the
-    folder is not there, or was removed by the holder that this call waited for.
+    folder is not there, or was removed by the holder that this call waited for. OwnershipConflict:
+    something else has the file's name.
     """
     # The library filelock gives none of this on all Pythons that we run on: its locks (flock)
     # outlive us in forked children, its earlier versions empty the file of the one who waits for
@@ -78,6 +80,9 @@ def folder_lock(
     if _holders.get(key) == own:
         yield
         return
+    refuse_misplaced(path.parent, [path])
+    if os.path.lexists(path) and not _is_regular(path):
+        raise misplaced(path, "a link, a pipe or a device")
     deadline = time.monotonic() + wait_s
     while not _claimed(key, own):
         _wait_or_refuse(path, deadline, f"another thread of this process (pid {os.getpid()})")
@@ -188,7 +193,7 @@ def _shared(path: Path, wait_s: float) -> Iterator[bool]:
         while (holder := _joined(key)) is not None:
             _wait_or_refuse(path, deadline, holder)
     except OSError as error:
-        # Not there, or not to be opened by this user.
+        # Not there, no file, or not to be opened by this user.
         if error.errno not in (*_NO_LOCKS, errno.ENOENT, errno.EACCES, errno.ELOOP):
             raise
         yield False
@@ -210,6 +215,8 @@ def _joined(key: str) -> str | None:
         if key in _read:
             _read[key].readers += 1
             return None
+        if not _is_regular(Path(key)):  # a pipe would be waited for
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), key)
         descriptor = os.open(key, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
         try:
             fcntl.lockf(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -222,6 +229,10 @@ def _joined(key: str) -> str | None:
         finally:
             if key not in _read:
                 os.close(descriptor)
+
+
+def _is_regular(path: Path) -> bool:
+    return stat.S_ISREG(path.lstat().st_mode)
 
 
 def _claimed(key: str, own: int) -> bool:
@@ -269,7 +280,8 @@ JOB_SCHEMA = 1
 def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False) -> Iterator[Path]:
     """Make or accept an output folder and hold its lock; gives its state folder ``.usdbrdf``.
 
-    A folder with files in it and no ``.usdbrdf/job.json`` is somebody else's: OwnershipConflict.
+    A folder with files in it, no ``.usdbrdf/job.json`` and no record of a step is somebody else's:
+    OwnershipConflict.
     Where nothing can be written: EnvironmentFailure. For FolderBusy and the options see
     ``folder_lock``. Where the work fails before anything is published, the folders that this call
     made are removed again, and nothing of another run.
@@ -289,7 +301,8 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
                         _remove_empty(state, made)
                     raise
             held.enter_context(_removed_if_unused(asset, made))
-            record = state / "job.json"
+            record, folders = state / "job.json", ("stamps", "work", "cache")
+            refuse_misplaced(asset, [record, *(state / name / "any" for name in folders)])
             try:
                 document = read_json(record)
                 schema = document.get("schema") if isinstance(document, dict) else None
@@ -304,7 +317,7 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
                 # Files of ours that a power cut spares would be nobody's without it.
                 for folder in (state, *made):
                     flush_folder(folder.parent)
-            for folder in (state, *(state / name for name in ("stamps", "work", "cache"))):
+            for folder in (state, *(state / name for name in folders)):
                 inside(asset, folder).mkdir(exist_ok=True)
                 for litter in folder.glob(f"{TEMPORARY_PREFIX}*"):
                     litter.unlink(missing_ok=True)  # what killed processes left half
@@ -352,10 +365,13 @@ def _accepted(asset: Path, made: list[Path]) -> Path:
         entry.name in ("stamps", "work", "cache", "lock") or entry.name.startswith(TEMPORARY_PREFIX)
         for entry in state.iterdir()
     )
-    if entries and not begun and not (state / "job.json").is_file():
+    # A record of ours that a step left tells as much.
+    ours = begun or (state / "job.json").is_file() or bool(known_hashes(state))
+    if entries and not ours:
         raise OwnershipConflict(
-            f"{asset}: the folder is not empty and was not made by usdbrdf. Name a new or empty "
-            "folder. [ownership.foreign]"
+            f"{asset}: the folder is not empty and was not made by usdbrdf, or came without its "
+            f"hidden folder {STATE_FOLDER}, which tells so. Bring that from where it was copied, "
+            "or name a new or empty folder. [ownership.foreign]"
         )
     inside(asset, state)
     inside(asset, state / "lock")

@@ -15,7 +15,7 @@ import math
 import re
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ from urllib.parse import quote, unquote
 
 from threadpoolctl import threadpool_limits
 
-from usdbrdf.errors import InputRefused, OwnershipConflict, UsdBrdfError
+from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import (
     environment_failures,
     flush_file,
@@ -38,7 +38,7 @@ from usdbrdf.files.atomic import (
     temporary_beside,
 )
 from usdbrdf.files.documents import json_text, load_arrays, save_arrays
-from usdbrdf.files.paths import inside
+from usdbrdf.files.paths import inside, refuse_misplaced
 from usdbrdf.job.arithmetic import name_of_arithmetic
 from usdbrdf.job.memory import give_back_freed
 from usdbrdf.job.progress import progress
@@ -287,7 +287,7 @@ def run_task(
         reason = why_rerun(asset, order, wanted)
         noted, done = read_stamp(journal), read_stamp(stamp)
         before = {path for each in (noted, done) if each for path in (*each.outputs, *each.once)}
-        _refuse_folders(asset, [stamp, journal, *(asset / path for path in sorted(before))])
+        refuse_misplaced(asset, [stamp, journal, *(asset / path for path in sorted(before))])
         interrupted = noted is not None and noted.fingerprint == wanted.fingerprint
         for path in work_folder.iterdir():  # this task's work for other parameters
             if re.fullmatch(rf"{re.escape(name)}-[0-9a-f]{{12}}", path.name) and path != folder:
@@ -328,25 +328,11 @@ def run_task(
         # Nobody could tell later whether these are whole: no hash of theirs is kept.
         for relative in run.once:
             flush_file(run.staged / relative)
-        _refuse_folders(asset, [asset / path for path in (*outputs, *finished.once)])
+        refuse_misplaced(asset, [asset / path for path in (*outputs, *finished.once)])
         write_stamp(journal, finished)
         _publish(asset, folder, finished, order)
         give_back_freed()
         return TaskResult(summary=summary, reran=True, reason=reason)
-
-
-def _refuse_folders(asset: Path, files: Sequence[Path]) -> None:
-    """OwnershipConflict where a folder lies in the place of a file of ours, or a file in that of a
-    folder: putting files in place would stop there each time, with some of them of another run."""
-    for file in files:
-        above = [folder for folder in file.parents if folder.is_relative_to(asset)]
-        wrong = [file] if file.is_dir() else [f for f in above if f.exists() and not f.is_dir()]
-        for place in wrong:
-            found, wanted = ("a folder", "file") if place == file else ("no folder", "folder")
-            raise OwnershipConflict(
-                f"{place}: this is {found}, and a {wanted} of usdbrdf's is to be here. Move it "
-                "away and run the same command again. [ownership.place]"
-            )
 
 
 def _own(folder: Path) -> Path:

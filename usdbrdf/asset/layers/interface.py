@@ -23,12 +23,14 @@ from usdbrdf.asset.header import (
     Provenance,
     Scopes,
     StageHeader,
+    capture_up_of,
     new_layer,
     read_header,
 )
 from usdbrdf.asset.layers.author import apply_schema, attribute, define, export, over
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.atomic import publish, temporary_beside
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.capture import Scan
@@ -37,6 +39,8 @@ from usdbrdf.model.mesh import ObjectLabel, welded
 Types = Sdf.ValueTypeNames
 # Who publishes an asset gives it a number.
 UNPUBLISHED = "work"
+# Bytes of a root layer that was cut off at its beginning: a block of a disk.
+_LONGEST_REST = 4096
 # Pivots lie on a grid of binary fractions of the unit: what is moved by them keeps its digits.
 _PER_UNIT = 1024
 # An abstract prim that a shot may define, to say something of all copies of an asset at once.
@@ -118,6 +122,20 @@ def write_root(path: Path, asset: Asset, header: StageHeader, capture_up: str = 
     payload = Sdf.Payload(f"./layers/{asset.contents_layer.name}")
     over(layer, scopes.root).payloadList.prependedItems = [payload]
     export(layer, path, folder=asset.folder)
+
+
+def mend_root(asset: Asset) -> bool:
+    """Write the root layer again of which nothing is left but USD's first line, or zeros: a copy
+    or a disk stopped there, and it shows an empty stage. All that has more in it is kept."""
+    root, scan = asset.root_layer, asset.layer("scan")
+    if not (root.is_file() and scan.is_file() and root.stat().st_size <= _LONGEST_REST):
+        return False
+    if root.read_bytes().strip(b"\0 \r\n") not in (b"", b"#usda 1.0"):
+        return False
+    with temporary_beside(root) as staged:
+        write_root(staged, asset, read_header(scan), capture_up_of(asset))
+        publish(staged, root)
+    return True
 
 
 def write_contents(path: Path, asset: Asset, header: StageHeader) -> None:
