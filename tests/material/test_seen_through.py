@@ -191,6 +191,15 @@ def test_of_darkness_much_may_show_through_that_is_next_to_nothing():
     assert found.at_least < 0.02
 
 
+def test_of_a_pane_before_mostly_dark_things_what_is_bright_counts():
+    behind = np.random.default_rng(4).uniform(4, 12, (40, VIEWS, 3))
+    behind[:25] *= 1e-3
+    behind = behind.reshape(-1, 3)
+    found = _shown(behind, 0.9, 0.2 + 0.9 * behind.mean())
+    assert found.share == pytest.approx(0.9, rel=0.1)
+    assert found.at_least > 0.8
+
+
 def test_no_more_shows_through_than_there_is_light():
     behind = np.random.default_rng(4).uniform(4.9, 5.1, (40 * VIEWS, 3))
     assert _shown(behind, 0.6, 1.0).share == pytest.approx(0.2, rel=0.01)

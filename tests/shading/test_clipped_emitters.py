@@ -13,7 +13,6 @@ from usdbrdf.shading import clipped_emitters as module
 from usdbrdf.shading.clipped_emitters import (
     ERROR_ALONE,
     LAMP_PRIOR,
-    LEAST_ERROR,
     EstimatedRadiance,
     Evidence,
     estimate_clipped_emitters,
@@ -85,8 +84,8 @@ def test_exact_light_gives_the_exact_lamps():
     np.testing.assert_allclose(found.multiplier, MULTIPLIER, rtol=0.005)
     assert found.determined.all()
     # One wall tells most of the first one; nothing but the stated error of such a lamp is left.
-    assert found.standard_error.max() < np.hypot(ERROR_ALONE, LEAST_ERROR) + 0.01
-    assert LEAST_ERROR <= found.standard_error.min() < np.hypot(0.06, LEAST_ERROR)
+    assert found.standard_error.max() < ERROR_ALONE + 0.01
+    assert found.standard_error.min() < 0.06
 
 
 @pytest.mark.parametrize(

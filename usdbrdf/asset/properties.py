@@ -389,7 +389,7 @@ class FittedObject(MeasuredObject):
         unit.""", high=1)]
     contradiction: Annotated[float, Fact(FIT, "contradiction", "float", 0.0, """Relative standard
         deviation between views, alike over the object or places of it, that no lobe explains, or
-        the share of the light behind it that shows through it for sure, whichever is more; authored
+        the share of its light that shows through it for sure, whichever is more; authored
         where it is too large for a surface, and things are seen through or in it; without unit.""",
         low=0)] = math.nan
     status: Annotated[str, Fact(FIT, "status", "token", "unseen", """measured: phi and psi come from

@@ -263,14 +263,15 @@ def fitted_by_likelier_lobe(
 
 def have_lobe_of_paper(looks: Sequence[FirstLook | None]) -> bool:
     """Whether the paper's lobe explains the views of all objects clearly better than that of
-    renderers. No object tells alone: of a few samples in noisy light one lobe may by chance seem
-    to explain all."""
+    renderers. It takes three objects: of one, with few samples in noisy light, a lobe may by chance
+    seem to explain all."""
     each = [
         look.log_ratio + look.ratio_of_beckmann * look.has_facets_after_beckmann
         for look in looks
         if look
     ]
-    return bool(np.clip(each, -_PAPER_CLEARER, _PAPER_CLEARER).sum() > _PAPER_CLEARER)
+    most = _PAPER_CLEARER / 2
+    return bool(np.clip(each, -most, most).sum() > _PAPER_CLEARER)
 
 
 class _Scene(NamedTuple):

@@ -24,7 +24,7 @@ _UPDATES = 4
 
 class Through(NamedTuple):
     """share: of the radiance behind that is seen, from 0 to 1; error: its standard deviation;
-    behind: that radiance in units of what is seen."""
+    behind: that radiance in units of what is seen, on the mean."""
 
     share: float
     error: float
@@ -79,7 +79,7 @@ def seen_through(
     most = np.where(far > 0, seen / np.where(far > 0, far, 1), np.inf).min(axis=1)
     return through._replace(
         share=min(through.share, float(np.median(most))),
-        behind=float(np.median(far.mean(axis=1) / np.maximum(seen.mean(axis=1), 1e-30))),
+        behind=float(far.sum() / max(seen.sum(), 1e-30)),
     )
 
 

@@ -223,6 +223,7 @@ def normal_equations(
 
 MAX_ERROR = calibration.number("lamps.max_error")
 LEAST_ERROR = calibration.number("lamps.least_error")
+UNTOLD = calibration.number("lamps.untold")
 _FEW_OBJECTS = calibration.count("lamps.few_objects")
 _STUDENT_FREEDOM = calibration.number("lamps.student_freedom")
 ALONE, ERROR_ALONE = calibration.pair("lamps.alone")

@@ -25,6 +25,7 @@ from usdbrdf.shading.asked import Shining, asked_texels, first_of_segments, irra
 from usdbrdf.shading.clipped_emitters import (
     LEAST_ERROR,
     MAX_ERROR,
+    UNTOLD,
     EstimatedRadiance,
     Evidence,
     estimate_clipped_emitters,
@@ -151,9 +152,9 @@ def estimate_clipped_light(
         return float(irradiance_of_texels(surface, light, dark, chosen, seed).sum())
 
     groups, estimate = lamps_with_unseen(surface.texels, coverage, groups, estimate, brought)
-    return ClippedLight(
-        lit=_with_estimates(lit, groups, estimate), groups=groups, estimate=estimate
-    )
+    lit = _with_estimates(lit, groups, estimate)
+    estimate = replace(estimate, standard_error=np.hypot(estimate.standard_error, UNTOLD))
+    return ClippedLight(lit=lit, groups=groups, estimate=estimate)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from usdbrdf.model.arrays import Array, Float, Int
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import asked_texels
+from usdbrdf.shading.clipped_emitters import UNTOLD
 from usdbrdf.shading.clipped_groups import clipped_groups
 from usdbrdf.shading.lamp_light import (
     LEAST_PART,
@@ -144,7 +145,7 @@ def lamps_that_explain(
             return UnseenLamps(
                 object=likely.object[order].astype(np.int32),
                 radiance=found[order].astype(np.float32),
-                error=error[order].astype(np.float32),
+                error=np.hypot(error[order], UNTOLD).astype(np.float32),
             )
         kept = np.flatnonzero(lamp)
     return UnseenLamps.none()
