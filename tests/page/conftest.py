@@ -12,6 +12,7 @@ import pytest
 from tests.evaluation.conftest import Made, make, silence  # noqa: F401
 from tests.json_schemas import check
 from tests.scenes import poses_down_and_up
+from usdbrdf.asset.properties import FittedObject
 from usdbrdf.page.report import report
 
 
@@ -21,6 +22,13 @@ def data_of(text: str) -> dict[str, Any]:
     assert found
     data: dict[str, Any] = json.loads(found[1])
     return data
+
+
+def fit_of(**numbers: Any) -> FittedObject:
+    """A fit that determined nothing, with other ``numbers``."""
+    usual = {"status": "prior", "evidence": 0.4, "target_frame": 0, "cost": 0.0, "num_pixels": 9,
+             "method": "views"}  # fmt: skip
+    return FittedObject(prim_path="/r", identifier="r", phi=0.3, psi=0.5, **usual | numbers)
 
 
 @pytest.fixture(scope="session")

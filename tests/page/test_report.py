@@ -16,9 +16,8 @@ import pytest
 from pxr import Usd
 
 import usdbrdf
-from tests.page.conftest import data_of
+from tests.page.conftest import data_of, fit_of
 from usdbrdf.asset.maps import camera_hits
-from usdbrdf.asset.properties import FittedObject
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView, measured_atlas, viewed_asset
 from usdbrdf.model.material import turned_up
@@ -230,24 +229,22 @@ def test_the_texture_of_a_map_is_made_once_for_all_cameras():
     assert all((picture.reshape(2, 3)[1] == _BACKGROUND).all() for picture in pictures)
 
 
-def fit_of(**numbers):
-    usual = {"status": "prior", "evidence": 0.4, "target_frame": 0, "cost": 0.0, "num_pixels": 9,
-             "method": "views"}  # fmt: skip
-    return FittedObject(prim_path="/r", identifier="r", phi=0.3, psi=0.5, **usual | numbers)
-
-
 def test_evidence_is_drawn_of_what_was_fitted_alone(monkeypatch):
     monkeypatch.setattr(objects, "_looked_at", lambda *_: None)
     monkeypatch.setattr(objects, "_pictures", lambda *_, **__: {})
     monkeypatch.setattr(objects, "_evidence", lambda *_: np.ones((1, 1)))
-    words = ["measured", "prior", "failed", "prior", "prior", "lamp", "unseen"]
-    monkeypatch.setattr(objects, "_numbers", lambda _a, i, *_: {"status": words[i]})
-    fits = [fit_of(status=word) for word in words]
-    fits[3:5] = fit_of(evidence=math.nan), fit_of(directive="glass")
-    where = Seen(share=np.full((1, 7), 0.1, np.float32), box=np.zeros((1, 7, 4), np.float32))
-    atlas = SimpleNamespace(frames=None, scene=SimpleNamespace(objects=[None] * 7))
+    drawn = [fit_of(status="measured"), fit_of(), fit_of(status="failed"),
+             fit_of(contradiction=0.45)]  # fmt: skip
+    left = [fit_of(evidence=math.nan), fit_of(directive="glass"), fit_of(kind="transparent"),
+            fit_of(status="lamp"), fit_of(status="unseen")]  # fmt: skip
+    fits, count = drawn + left, len(drawn + left)
+    monkeypatch.setattr(objects, "_numbers", lambda _a, i, *_: {"status": fits[i].status})
+    where = Seen(
+        share=np.full((1, count), 0.1, np.float32), box=np.zeros((1, count, 4), np.float32)
+    )
+    atlas = SimpleNamespace(frames=None, scene=SimpleNamespace(objects=[None] * count))
     rows = objects.object_rows(atlas, None, fits, where, [0], photographs=True, seed=0)
-    assert ["costs" in row for row in rows] == [True, True, True, False, False, False, False]
+    assert ["costs" in row for row in rows] == [True] * len(drawn) + [False] * len(left)
 
 
 def test_a_frame_is_read_and_traced_once_however_many_objects_it_shows(monkeypatch):

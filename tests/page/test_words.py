@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
 
-from tests.page.conftest import data_of
+import numpy as np
+import pytest
+
+from tests.page.conftest import data_of, fit_of
 from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.page.capture import findings
 from usdbrdf.page.daylight import is_dark
+from usdbrdf.page.objects import _numbers
+from usdbrdf.page.pictures import status_of
 from usdbrdf.transport.environment import NO_SUN, Environment, Sun
 
 
@@ -52,12 +57,41 @@ def test_a_night_is_dark_though_photographs_show_a_little_of_it(room):
     assert not is_dark(sky(0, sun), atlas)
 
 
-def test_metals_are_named_and_the_table_says_of_each_object_why_it_is_not_known(room, page_file):
+def test_metals_and_parts_that_shine_are_named():
     steps = {"texture": {}, "shade": {}}
     (said,) = findings(steps, ["measured"], True, metals=["tap"])[1:]
     assert said == "1 is a metal: tap."
     (said,) = findings(steps, ["measured"] * 2, True, metals=["tap", "pan"])[1:]
     assert said == "2 are metals: tap, pan."
+    (said,) = findings(steps, ["measured"], True, (), ["table"])[1:]
+    assert said == "A part of table shines, too."
+
+
+@pytest.mark.parametrize(
+    ("numbers", "in_sight", "because"),
+    [
+        ({"status": "measured"}, True, "measured"),
+        ({}, True, "prior"),
+        ({"kind": "transparent"}, True, "pane"),
+        ({"contradiction": 0.45}, True, "contradicted"),
+        ({"evidence": math.nan}, True, "sparse"),
+        ({"directive": "ignore"}, True, "told"),
+        ({"status": "unseen"}, True, "glimpsed"),
+        ({"status": "unseen"}, False, "unseen"),
+    ],
+)
+def test_the_table_says_of_an_object_why_it_is_not_known(room, numbers, in_sight, because):
+    _, atlas = measured_atlas(room.asset)
+    known = [status_of(atlas, i, None) for i in range(len(atlas.scene.objects))]
+    index = known.index("unseen")
+    fit = fit_of(**numbers)
+    row = _numbers(atlas, index, atlas.scene.objects[index], fit, in_sight)
+    assert (row["status"], row["because"]) == (fit.status, because)
+    lamp = known.index("lamp")
+    row = _numbers(atlas, lamp, atlas.scene.objects[lamp], fit, in_sight)
+    assert row["status"] == row["because"] == "lamp"
+
+
+def test_the_page_carries_these_words(page_file):
     rows = data_of(page_file.read_text("utf-8"))["objects"]
     assert {row["because"] for row in rows} >= {"lamp"}
-    assert all(row["because"] == row["status"] for row in rows if row["status"] == "measured")

@@ -23,9 +23,8 @@ from usdbrdf.transport.lit_scene import LitScene
 STEPS = ("ingest", "texture", "shade", "fit")
 # Those that are done for each lighting apart.
 _OF_LIGHTING = ("texture", "shade")
-# Frames that are read for their exposures, and pixels across the map, at most.
-_MOST_READ, _MAP_WIDTH = 96, 480
-_NAMED_LAMPS = 6
+# Frames that are read for their exposures, pixels across the map, and names in a sentence, at most.
+_MOST_READ, _MAP_WIDTH, _MOST_NAMED = 96, 480, 6
 _FLOORLESS = np.array((40, 44, 52), np.uint8)
 
 
@@ -158,45 +157,47 @@ def findings(
         f"{count.get('measured', 0)} of {total} objects have a measured roughness and specular."
     ]
     if metals:
-        told.append(f"{len(metals)} {_are(metals, 'a metal', 'metals')}: {_few(metals)}.")
+        told.append(
+            f"{len(metals)} {_by_count(len(metals), 'is a metal', 'are metals')}: {_few(metals)}."
+        )
     if prior := count.get("prior"):
         told.append(
-            f"{prior} {'is' if prior == 1 else 'are'} not determined: no photograph shows a clear "
+            f"{prior} {_by_count(prior, 'is', 'are')} not determined: no photograph shows a clear "
             "highlight, so the numbers are what remains likely, with an upper bound."
         )
     if sparse := count.get("sparse"):
         told.append(
-            f"{sparse} {'is' if sparse == 1 else 'are'} seen in too few pixels for a fit: the "
+            f"{sparse} {_by_count(sparse, 'is', 'are')} seen in too few pixels for a fit: the "
             "numbers are a guess."
         )
     if contradicted := count.get("contradicted"):
         told.append(
             f"The views of {contradicted} contradict that "
-            f"{'it is a surface' if contradicted == 1 else 'they are surfaces'}: something is seen "
-            f"through {'it or in it' if contradicted == 1 else 'them or in them'}."
+            f"{_by_count(contradicted, 'it is a surface', 'they are surfaces')}: something is seen "
+            f"through {_by_count(contradicted, 'it or in it', 'them or in them')}."
         )
     if left := count.get("told"):
-        told.append(f"{left} {'was' if left == 1 else 'were'} not fitted, by directive.")
+        told.append(f"{left} {_by_count(left, 'was', 'were')} not fitted, by directive.")
     if panes := count.get("pane"):
-        told.append(f"{panes} {'is a pane' if panes == 1 else 'are panes'} before the outside.")
+        told.append(f"{panes} {_by_count(panes, 'is a pane', 'are panes')} before the outside.")
     if failed := count.get("failed"):
         told.append(
-            f"The fit of {failed} failed: {'its' if failed == 1 else 'their'} photographs do not "
+            f"The fit of {failed} failed: {_by_count(failed, 'its', 'their')} photographs do not "
             "determine the numbers."
         )
     if glimpsed := count.get("glimpsed"):
         told.append(
-            f"Photographs hardly show {glimpsed}: nothing on {'it' if glimpsed == 1 else 'them'} "
+            f"Photographs hardly show {glimpsed}: nothing on {_by_count(glimpsed, 'it', 'them')} "
             "was measured, and everything but a colour is a guess."
         )
     if unseen := count.get("unseen"):
         told.append(f"No photograph shows {unseen if unseen < total else 'any'} of the objects.")
     if lamps := count.get("lamp"):
-        told.append(f"{lamps} {'is a lamp' if lamps == 1 else 'are lamps'}.")
+        told.append(f"{lamps} {_by_count(lamps, 'is a lamp', 'are lamps')}.")
     if shining_parts:
-        one = len(shining_parts) == 1
-        parts = f"{'A part' if one else 'Parts'} of {_few(shining_parts)}"
-        told.append(f"{parts} {'shines' if one else 'shine'}, too.")
+        many = len(shining_parts)
+        parts = f"{_by_count(many, 'A part', 'Parts')} of {_few(shining_parts)}"
+        told.append(f"{parts} {_by_count(many, 'shines', 'shine')}, too.")
     texture, shade = found["texture"], found["shade"]
     if "measured_fraction" in texture:
         told.append(
@@ -246,17 +247,18 @@ def _estimated_lamps(names: Sequence[str], *, never_observed: bool) -> list[str]
     """In one sentence at most, also of a room with hundreds."""
     if not names:
         return []
-    one = len(names) == 1
-    lamps = f"he lamp{'' if one else 's'} {_few(names)}"
+    count = len(names)
+    lamps = f"he {_by_count(count, 'lamp', 'lamps')} {_few(names)}"
     how = f"No photograph measures t{lamps}" if never_observed else f"T{lamps} clipped everywhere"
-    what = "its radiance is an estimate" if one else "their radiances are estimates"
+    what = _by_count(count, "its radiance is an estimate", "their radiances are estimates")
     return [f"{how}: {what}."]
 
 
-def _are(things: Sequence[str], one: str, many: str) -> str:
-    return f"is {one}" if len(things) == 1 else f"are {many}"
+def _by_count(count: int, one: str, many: str) -> str:
+    """What is said of one thing, or of none or several."""
+    return one if count == 1 else many
 
 
 def _few(names: Sequence[str]) -> str:
-    more = len(names) - _NAMED_LAMPS
-    return ", ".join(names[:_NAMED_LAMPS]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - _MOST_NAMED
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")

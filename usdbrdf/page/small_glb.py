@@ -1,9 +1,10 @@
 """Binary glTF for a page: the same pictures of it in a third of the bytes.
 
-Positions lie on a grid of the whole room, texture coordinates and normals in small integers
-(KHR_mesh_quantization); vertices that are equal there are one, in the order in which triangles use
-them; and each array is stored as its differences, byte by byte, which compress well. ``unfiltered``
-of web/room.js takes that last step back, for which the document's extras name the arrays."""
+Positions lie on a grid of the whole room, those of a small mesh on one that divides it; texture
+coordinates and normals are small integers (KHR_mesh_quantization); vertices that are equal there
+are one, in the order in which triangles use them; and each array is stored as its differences, byte
+by byte, which compress well. ``unfiltered`` of web/room.js takes that last step back, for which the
+document's extras name the arrays."""
 
 from __future__ import annotations
 
@@ -26,8 +27,12 @@ _TYPES: dict[int, np.dtype[Any]] = {
 }  # fmt: skip
 _COUNTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _SMALLER = {"POSITION", "NORMAL", "TEXCOORD_0"}
-# Steps of the grid along the room, and of texture coordinates, which are multiples of the latter.
-_STEPS, _TEXTURE_STEP = 65535, 16
+# Of a node: with one of them, its mesh or others lie in another place than the mesh says.
+_PLACING = {"matrix", "translation", "rotation", "scale", "children"}
+# The largest number of two bytes; and texture coordinates are multiples of this.
+_LARGEST, _TEXTURE_STEP = 65535, 16
+# Steps of its grid along a mesh, at least.
+_FEWEST = 1 << 12
 _HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 
 
@@ -49,10 +54,11 @@ def small_glb(content: bytes) -> bytes:
     if not meshes:
         return content
     every = np.concatenate([np.stack([m.position.min(0), m.position.max(0)]) for m in meshes])
-    step = max(float((every.max(axis=0) - every.min(axis=0)).max()) / _STEPS, 1e-9)
+    # A mesh's numbers begin at the step before it, so that they may end one after its extent.
+    step = max(_extent(every) / (_LARGEST - 1), 1e-9)
     kept = _Kept(document, binary, {id(mesh.primitive) for mesh in meshes})
     for mesh in meshes:
-        _put(kept, mesh, step)
+        _put(kept, mesh, _step_of(mesh, step))
     return kept.file()
 
 
@@ -129,16 +135,30 @@ def filtered(values: Array) -> bytes:
     return np.ascontiguousarray(planes.transpose(0, 2, 1)).tobytes()
 
 
+def _extent(position: Array) -> float:
+    """Along the longest axis."""
+    return float(np.ptp(position, axis=0).max())
+
+
+def _step_of(mesh: _Mesh, step: float) -> float:
+    """That of the room, halved until a small mesh keeps its shape; so its grid holds every point
+    of the room's, and the seams between meshes stay below half of the room's step."""
+    extent = _extent(mesh.position)
+    while 0 < extent < _FEWEST * step:
+        step /= 2
+    return step
+
+
 def _put(kept: _Kept, mesh: _Mesh, step: float) -> None:
     low = np.floor(mesh.position.min(axis=0) / step).astype(np.int64)
     grid = np.rint(mesh.position / step).astype(np.int64) - low
-    texture = np.rint(mesh.texture * (_STEPS / _TEXTURE_STEP)).astype(np.int64) * _TEXTURE_STEP
+    texture = np.rint(mesh.texture * (_LARGEST / _TEXTURE_STEP)).astype(np.int64) * _TEXTURE_STEP
     # Rows of positions and normals begin at multiples of four bytes.
     rows = np.zeros((len(grid), 10), np.int64)
     rows[:, 0:3], rows[:, 4:7] = grid, np.rint(mesh.normal * 127)
-    rows[:, 8:10] = np.minimum(texture, _STEPS)
+    rows[:, 8:10] = np.minimum(texture, _LARGEST)
     rows, corners = _in_order_of_use(rows, mesh.corners)
-    position, short = rows[:, :4].astype("<u2"), len(rows) <= _STEPS
+    position, short = rows[:, :4].astype("<u2"), len(rows) <= _LARGEST
     mesh.node["translation"], mesh.node["scale"] = (low * step).tolist(), [step] * 3
     mesh.primitive["attributes"] = {
         "POSITION": kept.add(
@@ -166,19 +186,20 @@ def _in_order_of_use(rows: Long, corners: Long) -> tuple[Long, Long]:
 
 
 def _meshes(document: dict[str, Any], binary: bytes) -> list[_Mesh]:
-    """Those of one node without a place of its own, whose textures do not repeat."""
+    """Those of one node that neither has a place of its own nor gives one to others, and whose
+    textures do not repeat."""
     nodes = document.get("nodes", ())
     uses = Counter(node["mesh"] for node in nodes if "mesh" in node)
     found = []
     for node in nodes:
-        if "mesh" not in node or uses[node["mesh"]] > 1 or node.keys() & {"matrix", "translation"}:
+        if "mesh" not in node or uses[node["mesh"]] > 1 or node.keys() & _PLACING:
             continue
         primitives = document["meshes"][node["mesh"]]["primitives"]
         if len(primitives) != 1 or primitives[0]["attributes"].keys() != _SMALLER:
             continue
         primitive = primitives[0]
         position, normal, texture = (
-            _read(document, binary, primitive["attributes"][name])
+            _read(document, binary, primitive["attributes"][name]).astype(np.float64)
             for name in ("POSITION", "NORMAL", "TEXCOORD_0")
         )
         if texture.min() < 0 or texture.max() > 1:
