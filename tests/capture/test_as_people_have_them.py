@@ -286,6 +286,50 @@ def test_what_lies_outside_is_not_opened_however_its_path_ends(made, tmp_path):
         _read(made)
 
 
+@pytest.mark.parametrize("suffix", [".exr", ""])
+def test_what_is_there_is_meant_not_its_namesake_in_the_capture(made, tmp_path, suffix):
+    """Another picture was taken in its place, without more than a warning of a moved capture."""
+    (tmp_path / "old/frames").mkdir(parents=True)
+    shutil.copyfile(made.image(0), tmp_path / "old/frames/0003.exr")
+    shutil.copyfile(made.folder / "mesh.ply", tmp_path / "old/mesh.ply")
+    _rename(made, str(tmp_path / "old/frames/{:04d}") + suffix)
+    with pytest.raises(InputRefused, match=r"--allow-outside.*\[paths\.outside\]$"):
+        _read(made)
+    _rename(made, "frames/{:04d}.exr")
+    with edited(made.manifest) as document:
+        document["mesh"] = "../old/mesh.ply"
+    with pytest.raises(InputRefused, match=r"--allow-outside.*\[paths\.outside\]$"):
+        _read(made)
+    assert len(_read(made, allow_outside=(tmp_path / "old",)).frames) == 12
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_picture_that_is_nowhere_costs_its_frame_in_whatever_order(made, first):
+    """It refused the capture where it came before the first that was found."""
+    _rename(made, "/home/me/scan/frames/{:04d}.exr")
+    made.image(0 if first else 11).unlink()
+    assert len(_read(made).frames) == 11
+
+
+def test_masks_that_were_not_brought_are_no_photographs(made):
+    """An end of one part is a photograph's name as often as a mask's."""
+    with edited(made.manifest) as document:
+        for frame in document["frames"]:
+            frame["mask_path"] = f"/home/me/masks/{Path(frame['file_path']).name}"
+    made.image(0).rename(made.folder / "0000.exr")
+    _read_refused = r"absolute path.*\[paths\.outside\]$"
+    with edited(made.manifest) as document:
+        document["frames"][0]["file_path"] = "0000.exr"
+    with pytest.raises(InputRefused, match=_read_refused):
+        _read(made)
+    with edited(made.manifest) as document:
+        for frame in document["frames"]:
+            frame["mask_path"] = f"/home/me/masks/{frame['file_path']}"
+        document["frames"][0].pop("mask_path")
+    with pytest.raises(InputRefused, match=r"is a picture of a frame.*\[capture\.mask\]$"):
+        _read(made)
+
+
 def test_the_rolling_shutter_of_instant_ngp_is_told(made):
     with edited(made.manifest) as document:
         document["rolling_shutter"] = [0, 0, 0, 0]

@@ -10,7 +10,7 @@ import pytest
 from tests.scenes import as_mitsubas, edited, make_capture, rescale_images, room_mesh, write_ply
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.formats.transforms import frame_records
+from usdbrdf.capture.formats.transforms import frame_records, matches
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.frames import read_frame
 from usdbrdf.files.images import read_exr, write_preview_png
@@ -112,6 +112,10 @@ def test_cameras_that_are_said_to_be_opencvs_are(capture, key, word):
         ({"camera_convention": "OpenGL"}, None),
         ({"camera_convention": "blender", "world_convention": "opencv"}, None),
         ({"camera_convention": {"x": "right"}}, None),
+        ({"distortion_convention": "opencv", "pixel_convention": "colmap"}, None),
+        ({"principal_point_convention": "opencv", "intrinsics_convention": "opencv"}, None),
+        ({"depth_convention": "OpenCV", "naming_convention": "colmap"}, None),
+        ({"point_cloud_coordinate_system": "opencv"}, None),
         ({"pose_convention": "world_to_camera"}, "not known here"),
     ],
 )
@@ -131,6 +135,39 @@ def test_two_conventions_are_refused(capture):
         document |= {"camera_convention": "opencv", "convention": "opengl"}
     with pytest.raises(InputRefused, match=r"states two conventions.*\[capture\.convention\]$"):
         read_scan(capture.folder, IngestOptions())
+
+
+@pytest.mark.parametrize("stated", [{}, {"camera_convention": "blender"}])
+def test_a_frame_may_state_no_other_convention_than_the_document(capture, stated):
+    """It was passed over."""
+    with edited(capture.manifest) as document:
+        document |= stated
+        document["frames"][3]["camera_convention"] = "opencv"
+    with pytest.raises(
+        InputRefused, match=r"frames\[3\] states.*'opencv'.*\[capture\.convention\]$"
+    ):
+        read_scan(capture.folder, IngestOptions())
+    _as_opencvs(capture)
+    with edited(capture.manifest) as document:
+        document["camera_convention"] = "OpenCV"
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-12)
+
+
+def test_a_mesh_that_is_no_name_does_not_matter_where_the_user_names_one(capture):
+    with edited(capture.manifest) as document:
+        document["mesh"] = ["a"]
+    scan = read_scan(capture.folder, IngestOptions(mesh=capture.folder / "mesh.ply"))
+    assert len(scan.frames) == 12
+    with pytest.raises(InputRefused, match=r"mesh is not a file name.*\[capture\.format\]$"):
+        read_scan(capture.folder, IngestOptions())
+
+
+@pytest.mark.parametrize("text", ['{"scene": "room"}', '{"frames": 3}', "[]", "{"])
+def test_a_scene_meta_of_another_program_is_no_capture(tmp_path, text):
+    """It took captures from the adapters that are asked later."""
+    (tmp_path / "scene_meta.json").write_text(text)
+    assert not matches(tmp_path)
 
 
 def test_scenes_of_mapanything_are_read(capture):
@@ -169,6 +206,20 @@ def test_skew_is_the_number_beside_the_focal_length(capture, key):
     points = np.array([[0.2, -0.3, 1.0], [0.1, 0.4, 1.0], [-0.5, 0.1, 1.0]])
     imaged = record.lens.project(points * [1, -1, -1], record.intrinsics)
     np.testing.assert_allclose(imaged, (points @ matrix.T)[:, :2], atol=1e-9)
+
+
+@pytest.mark.parametrize("focal", ["fl_x", "camera_angle_x", "x_fov"])
+def test_skew_is_of_whatever_states_the_focal_length(capture, focal):
+    """It was refused beside an angle."""
+    fx, width = capture.intrinsics[0], 32
+    angle = 2 * np.arctan(width / 2 / fx)
+    value = {"fl_x": fx, "camera_angle_x": angle, "x_fov": np.degrees(angle)}[focal]
+    with edited(capture.manifest) as document:
+        for holder in (document, *document["frames"]):
+            holder.pop("fl_x", None)
+        document |= {"skew": 3.0, focal: value}
+    (record, *_) = frame_records(capture.manifest, IngestOptions(), Findings())
+    assert record.lens.skew == pytest.approx(3.0 / fx)
 
 
 @pytest.mark.parametrize("key", ["b1", "p3", "sk_y"])

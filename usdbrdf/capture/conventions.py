@@ -1,11 +1,17 @@
-"""Readings of camera poses that are mixed up with ours: OpenGL axes, world from camera."""
+"""Readings of camera poses that are mixed up with ours: OpenGL axes, world from camera; and what
+documents say of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from usdbrdf.capture.checks import Findings
+from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Double
 
 # OpenCV's camera (y down, looking down +z) has OpenGL's second and third axis reversed.
@@ -13,6 +19,15 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 # What nerfstudio's documents of 2022 had done to the world without saying so.
 OLD_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+# Keys under which documents state the axes of cameras, and what they say. Those of distortion,
+# pixels, depths or worlds say nothing of them, whatever word they have.
+_CONVENTIONS = frozenset((
+    "camera_convention", "convention", "coordinate_convention", "pose_convention",
+    "camera_coordinate_system", "camera_coordinate_frame", "camera_axes",
+))  # fmt: skip
+_AXES = dict.fromkeys(("opencv", "opencvc2w", "colmap", "rdf"), "OpenCV") | dict.fromkeys(
+    ("opengl", "openglc2w", "blender", "nerf", "nerfstudio", "instantngp", "rub"), "OpenGL"
+)
 
 
 def opengl_from_opencv(world_from_camera: Double) -> Double:
@@ -106,3 +121,59 @@ def _of_units() -> dict[str, Callable[[Double], Double]]:
 
 # And of units, of which hits do not tell: from one point in a room everything is hit.
 UNITS = _of_units()
+
+
+def _stated(holder: Mapping[str, Any]) -> dict[str, str]:
+    """What a document or a frame says of its cameras' axes, by the keys under which it does:
+    camera_convention is MapAnything's (WAI), and always "opencv"; the others people make up."""
+    words = ((key, value) for key, value in holder.items() if key.lower() in _CONVENTIONS)
+    return {key: value for key, value in words if isinstance(value, str)}
+
+
+def _axes(word: str) -> str | None:
+    return _AXES.get(re.sub(r"[\W_]", "", word.lower()))
+
+
+def are_said_to_be_opencvs(document: Mapping[str, Any]) -> bool:
+    """Whether a document says that its cameras look down +z with y down."""
+    return "OpenCV" in map(_axes, _stated(document).values())
+
+
+def warn_of_conventions(
+    document: Mapping[str, Any],
+    frames: Iterable[Mapping[str, Any]],
+    source: Path,
+    findings: Findings,
+) -> None:
+    """One sentence on axes that a document states, if they are not OpenGL's; InputRefused where it
+    states two, or a frame others than it does."""
+    stated = _stated(document)
+    known = {key: axes for key, word in stated.items() if (axes := _axes(word))}
+    if len(set(known.values())) > 1:
+        said = ", ".join(f"{key} {stated[key][:40]!r}" for key in known)
+        raise InputRefused(
+            f"{source}: states two conventions of its cameras, {said}. Keep the one that its poses "
+            "have. [capture.convention]"
+        )
+    taken = next(iter(known.values()), "OpenGL")
+    for i, frame in enumerate(frames):
+        other = next((item for item in _stated(frame).items() if _axes(item[1]) != taken), None)
+        if other is not None and other[1] not in stated.values():
+            raise InputRefused(
+                f"{source}: frames[{i}] states {other[0]} {other[1][:40]!r}, but the document "
+                f"{'states another' if known else 'none'}, and is read as {taken}'s. State "
+                "camera_convention once, opencv or opengl, beside the list of frames, all of whose "
+                "poses are to have it. [capture.convention]"
+            )
+    for key, word in stated.items():
+        if known.get(key) == "OpenCV":
+            findings.warn(
+                f"{source.name}: {key} is {word!r}, so its cameras are read as such that look down "
+                "+z with y down. [capture.convention]"
+            )
+        elif key not in known:
+            findings.warn(
+                f"{source.name}: {key} is {word[:40]!r}, which is not known here; its cameras are "
+                "read as OpenGL's, from camera to world. If they are not, convert them, or state "
+                "camera_convention opencv. [capture.convention]"
+            )

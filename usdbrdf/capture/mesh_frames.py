@@ -1,10 +1,11 @@
-"""Which mesh is a capture's, and in which frame it lies: where the points lie on it that its
-photographs share, and in which scene of several cameras a document stands whose own mesh is that of
-the scene."""
+"""Where the files are that a capture's documents name. Which mesh is a capture's, and in which
+frame it lies: where the points lie on it that its photographs share, and in which scene of several
+cameras a document stands whose own mesh is that of the scene."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,20 @@ _FITS = 0.05
 _OF_SCANNETPP = ("dslr", "iphone")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
 _UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
+
+
+def path_in_capture(root: Path, candidate: str, options: CaptureOptions, *, cure: str = "") -> Path:
+    """The absolute path of ``candidate``, which may be absolute if it leads to what lies in root;
+    InputRefused if it leaves root and --allow-outside, which says what to do by ``cure``, see
+    ``contained``."""
+    homes = (root,) if PurePosixPath(candidate).is_absolute() else ()
+    for folder in (*homes, *options.allow_outside) if candidate else ():
+        with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
+            candidate.encode()
+            path = (root / candidate).resolve()
+            if path.is_relative_to(folder.resolve()):
+                return path
+    return contained(root, candidate, cure=cure)
 
 
 def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) -> Path:

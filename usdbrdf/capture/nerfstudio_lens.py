@@ -32,7 +32,7 @@ def lens_of_frame(
     refuse: Callable[[str], InputRefused],
 ) -> Lens:
     """What camera_model, or instant-ngp's is_fisheye, and the distortion of a frame, else of the
-    document, say.
+    document, say; but for ``with_skew``.
 
     k1 to k4 are coefficients of r^2 to r^8, as nerfstudio has them; where k5 or k6 stand beside
     them, k4 to k6 are OpenCV's, which divide.
@@ -57,10 +57,9 @@ def lens_of_frame(
             f"has {unread} {number(unread):g}, a term of its lens that is not read. Undistort the "
             "images to a pinhole camera first, or remove it."
         )
-    skew = _skew(number, refuse)
     circle = _circle(number, refuse) if curve == "fisheye" else math.inf
     if (listed := said.get("distortion_params")) is not None:
-        return replace(_listed_lens(curve, listed, circle, refuse), skew=skew)
+        return _listed_lens(curve, listed, circle, refuse)
     terms = {key: number(key) for key in _DISTORTION}
     k1, k2, k3, k4, k5, k6, p1, p2, s1, s2, s3, s4 = (value or 0.0 for value in terms.values())
     divides = terms["k5"] is not None or terms["k6"] is not None
@@ -70,18 +69,38 @@ def lens_of_frame(
         divisor=(k4, k5, k6) if divides else (),
         tangential=(p1, p2),
         prism=(s1, s2, s3, s4),
-        skew=skew,
         circle=circle,
     )
 
 
-def _skew(number: Callable[[str], float | None], refuse: Callable[[str], InputRefused]) -> float:
-    """In focal lengths, as ``Lens`` has it."""
+def with_skew(lens: Lens, number: Callable[[str], float | None], focal: float) -> Lens:
+    """The lens with the skew that is stated in pixels, of which ``focal`` is the length fx."""
     stated = next((value for key in _SKEW if (value := number(key))), 0.0)
-    focal = number("fl_x")
-    if stated and not focal:
-        raise refuse(f"has a skew of {stated:g} pixels, but no fl_x. State it, or remove the skew.")
-    return stated / focal if stated and focal else 0.0
+    return replace(lens, skew=stated / focal) if lens.curve != "equirectangular" else lens
+
+
+def focal_of_angle(
+    positive: Callable[[str], float | None],
+    refuse: Callable[[str], InputRefused],
+    axis: str,
+    size: float,
+) -> float | None:
+    """The focal length in pixels of an image that is as wide as an angle, of the two that documents
+    have for it, the second instant-ngp's; None without either."""
+    for key, half_turn, unit in (
+        (f"camera_angle_{axis}", math.pi, "radians"),
+        (f"{axis}_fov", 180.0, "degrees"),
+    ):
+        angle = positive(key)
+        if angle is not None and angle >= half_turn:
+            # Its tangent may be that of another angle altogether.
+            raise refuse(
+                f"{key} is {angle:g}, but it is in {unit}, below {half_turn:.4g}. Correct it, or "
+                "state the focal length in pixels."
+            )
+        if angle is not None:
+            return size / (2 * math.tan(angle / half_turn * math.pi / 2))
+    return None
 
 
 def _lens_key(said: Mapping[str, Any]) -> str:

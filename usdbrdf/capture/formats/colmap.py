@@ -29,8 +29,8 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
-from usdbrdf.capture.formats.named_pictures import Pictured, mask_beside, path_in_capture, scan_of
-from usdbrdf.capture.mesh_frames import mesh_beside, scene_above, why_elsewhere
+from usdbrdf.capture.formats.named_pictures import Pictured, mask_beside, scan_of
+from usdbrdf.capture.mesh_frames import mesh_beside, path_in_capture, scene_above, why_elsewhere
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
@@ -225,6 +225,7 @@ def _chosen(path: Path, options: CaptureOptions, findings: Findings) -> _Chosen:
     if not candidates and options.frames is None:
         candidates = _elsewhere(path, workspaces, findings)
     if not candidates:
+        pictured.refuse_what_leads_out()
         where = f"{path}: none of the images that the COLMAP model names is there, first {first!r}"
         if not workspaces:
             where = f"{path}: no COLMAP model (cameras and images, .bin or .txt)"

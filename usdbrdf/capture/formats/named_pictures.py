@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
 from usdbrdf.capture.develop import with_rims
+from usdbrdf.capture.mesh_frames import path_in_capture
 from usdbrdf.capture.parts import (
     LabelTable,
     as_photographs,
@@ -41,22 +42,9 @@ _PHOTOGRAPHS, _RADIANCE = frozenset((".jpg", ".jpeg")) | _OF_CAMERAS, (".exr", "
 FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
 # Of documents that name pictures where they lay on another machine.
 _OTHER_FOLDER = "Name the folder of the pictures with --frames, or name them relative to this one"
+_THERE = "It is there: allow its folder with --allow-outside, or put the file inside this one"
 _LETTERS: tuple[Callable[[str], str], ...] = (str, str.lower)  # in which names are compared
 _MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
-
-
-def path_in_capture(root: Path, candidate: str, options: CaptureOptions, *, cure: str = "") -> Path:
-    """The absolute path of ``candidate``, which may be absolute if it leads to what lies in root;
-    InputRefused if it leaves root and --allow-outside, which says what to do by ``cure``, see
-    ``contained``."""
-    homes = (root,) if PurePosixPath(candidate).is_absolute() else ()
-    for folder in (*homes, *options.allow_outside) if candidate else ():
-        with suppress(OSError, RuntimeError, ValueError):  # ``contained`` says what is wrong
-            candidate.encode()
-            path = (root / candidate).resolve()
-            if path.is_relative_to(folder.resolve()):
-                return path
-    return contained(root, candidate, cure=cure)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,13 +231,14 @@ class Pictured:
     moved: dict[str, Path] = field(default_factory=dict)
     instead: dict[Path, Path] = field(default_factory=dict)
     _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
+    _refused: list[InputRefused] = field(default_factory=list)
 
     def of(self, name: str, below: str = "") -> Path | None:
         """The picture called ``name`` in the folder ``below``: the file of this name, else the one
         there whose name differs in nothing but case and kind of picture, radiance first; of a
         photograph that is there too, the radiance beside it, of HEIF any; of what leads out, as
         from where the capture lay before, that at its end. Of ``--frames``, the picture there that
-        has its name. None where there is none. InputRefused for what leads out if all does.
+        has its name. None where there is none. InputRefused for what leads out and is there.
         """
         if self.options.frames is not None:
             return self._of_frames.named(name)
@@ -259,12 +248,18 @@ class Pictured:
             if "\\" in name and not path.is_file():
                 whole = whole.replace("\\", "/")
                 path = path_in_capture(self.folder, whole, self.options, cure=_OTHER_FOLDER)
-        except InputRefused:
+        except InputRefused as refused:
             found = self._at_end_of(whole, lambda path: self._picture(path, name))
-            if found is None and not self.moved:
-                raise
+            if found is None:
+                self._refused.append(refused)
             return found
         return self._picture(path, name)
+
+    def refuse_what_leads_out(self) -> None:
+        """InputRefused if pictures lead out of the folder and not one was found at its end in it;
+        to be asked once all are asked for, in whatever order."""
+        if self._refused and not self.moved:
+            raise self._refused[0]
 
     def _picture(self, path: Path, name: str) -> Path | None:
         beside = self._in_folder(path.parent)
@@ -281,27 +276,34 @@ class Pictured:
             self.otherwise[name] = nearest
         return nearest
 
-    def file(self, name: str) -> Path:
+    def file(self, name: str, *, fewest: int = 1) -> Path:
         """Another file that the document names, which need not be there, with what leads out taken
-        alike."""
+        alike, by an end of ``fewest`` parts or more."""
         try:
             return path_in_capture(self.folder, name, self.options)
         except InputRefused:
-            if found := self._at_end_of(name, lambda path: path if path.is_file() else None):
+            if found := self._at_end_of(name, lambda p: p if p.is_file() else None, fewest):
                 return found
             raise
 
-    def _at_end_of(self, path: str, look: Callable[[Path], Path | None]) -> Path | None:
-        """What one looks for at the first end of a path where it is, if that does not lead out."""
+    def _at_end_of(
+        self, path: str, look: Callable[[Path], Path | None], fewest: int = 1
+    ) -> Path | None:
+        """What one looks for at the first end of a path where it is, if that does not lead out;
+        InputRefused where the path itself leads to something, which is meant."""
+        if any(os.path.lexists(self.folder / f"{path}{suffix}") for suffix in ("", *SUFFIXES)):
+            contained(self.folder, path, cure=_THERE)
         for end in ends_of(path):
             with suppress(InputRefused):
-                if found := look(path_in_capture(self.folder, end, self.options)):
+                enough = end.count("/") + 1 >= fewest
+                if enough and (found := look(path_in_capture(self.folder, end, self.options))):
                     self.moved[path] = found
                     return found
         return None
 
     def warn_of_others(self, findings: Findings, source: Path) -> None:
         """One sentence each where pictures were taken for others, and radiance for photographs."""
+        self.refuse_what_leads_out()
         if self.moved:
             name, path = next(iter(self.moved.items()))
             findings.warn(

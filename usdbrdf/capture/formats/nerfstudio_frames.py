@@ -12,7 +12,6 @@ order (nerf_loader.h, marching_cubes.cu).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath, PurePosixPath
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.conventions import OLD_NERFSTUDIO
+from usdbrdf.capture.conventions import OLD_NERFSTUDIO, are_said_to_be_opencvs
 from usdbrdf.capture.formats.colmap import world_from_camera
 from usdbrdf.capture.mesh_frames import Lies, lies_with_points
 from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix, rigid_pose
@@ -51,11 +50,6 @@ _MODELS = ("colmap_sparse/0", "colmap_text", "colmap/sparse/0", "sparse/0", "spa
 # less than the rounding of who writes few digits is no other frame.
 _SAME_CAMERA, _SAME_FRAME = 1e-2, 1e-4
 _LARGEST = 1e9  # number that makes sense in a matrix
-# Keys that state the axes of cameras, not of the world, and what they say.
-_CONVENTION = re.compile(r"(?i)^(?!.*world).*(convention|coordinate_?(system|frame)|camera_axes)")
-_AXES = dict.fromkeys(("opencv", "opencvc2w", "colmap", "rdf"), "OpenCV") | dict.fromkeys(
-    ("opengl", "openglc2w", "blender", "nerf", "nerfstudio", "instantngp", "rub"), "OpenGL"
-)
 # By which instant-ngp's meshes are known, PLY and OBJ; what it takes where a document says nothing.
 _OF_NGP = (b"output from https://github.com/NVlabs/instant-ngp", b"mtllib nerf.mtl")
 _NGP_SCALE, _NGP_OFFSET = 0.33, 0.5
@@ -123,45 +117,7 @@ def camera_axes(document: Mapping[str, Any]) -> Double:
     Mitsuba's have x to the left and look down +z (nerf_matrix_to_ngp); others may be stated."""
     if _is_mitsubas(document):
         return np.diag([-1.0, 1, -1, 1])
-    stated = {_AXES.get(_plain(word)) for word in stated_conventions(document).values()}
-    return np.diag([1.0, -1, -1, 1]) if "OpenCV" in stated else np.eye(4)
-
-
-def stated_conventions(document: Mapping[str, Any]) -> dict[str, str]:
-    """What a document says of its cameras' axes, by the keys under which it does: camera_convention
-    is MapAnything's (WAI), and always "opencv"; the others people make up."""
-    words = ((key, value) for key, value in document.items() if _CONVENTION.search(key))
-    return {key: value for key, value in words if isinstance(value, str)}
-
-
-def warn_of_conventions(document: Mapping[str, Any], source: Path, findings: Findings) -> None:
-    """One sentence on axes that a document states, if they are not OpenGL's; InputRefused where it
-    states two."""
-    stated = stated_conventions(document)
-    known = {key: axes for key, word in stated.items() if (axes := _AXES.get(_plain(word)))}
-    if len(set(known.values())) > 1:
-        said = ", ".join(f"{key} {stated[key][:40]!r}" for key in known)
-        raise InputRefused(
-            f"{source}: states two conventions of its cameras, {said}. Keep the one that its poses "
-            "have. [capture.convention]"
-        )
-    for key, word in stated.items():
-        if known.get(key) == "OpenCV":
-            findings.warn(
-                f"{source.name}: {key} is {word!r}, so its cameras are read as such that look down "
-                "+z with y down. [capture.convention]"
-            )
-        elif key not in known:
-            findings.warn(
-                f"{source.name}: {key} is {word[:40]!r}, which is not known here; its cameras are "
-                "read as OpenGL's, from camera to world. If they are not, convert them, or state "
-                "camera_convention opencv. [capture.convention]"
-            )
-
-
-def _plain(word: str) -> str:
-    """Letters and digits alone, small."""
-    return re.sub(r"[\W_]", "", word.lower())
+    return np.diag([1.0, -1, -1, 1]) if are_said_to_be_opencvs(document) else np.eye(4)
 
 
 def _is_mitsubas(document: Mapping[str, Any]) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
-from usdbrdf.capture.formats.named_pictures import path_in_capture
+from usdbrdf.capture.mesh_frames import path_in_capture
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.camera_checks import warn_of_rolling_shutter
 from usdbrdf.capture.checks import Findings, FrameRecord, at_image_size, clause_of
-from usdbrdf.capture.conventions import OLD_NERFSTUDIO
+from usdbrdf.capture.conventions import OLD_NERFSTUDIO, warn_of_conventions
 from usdbrdf.capture.formats.named_pictures import Pictured, scan_of
 from usdbrdf.capture.formats.nerfstudio_frames import (
     EXPORTED,
@@ -29,10 +29,9 @@ from usdbrdf.capture.formats.nerfstudio_frames import (
     stated_pose,
     statements_beside,
     warn_of_bad,
-    warn_of_conventions,
 )
 from usdbrdf.capture.mesh_frames import mesh_beside, scene_above
-from usdbrdf.capture.nerfstudio_lens import lens_of_frame
+from usdbrdf.capture.nerfstudio_lens import focal_of_angle, lens_of_frame, with_skew
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.rigid_poses import is_camera_matrix
 from usdbrdf.capture.unrecognised import other_program
@@ -55,8 +54,10 @@ _LARGEST = 1e15
 # Where no size is stated: a principal point this far from the image's centre, or an image this much
 # wider than its angle says, in parts of its size, belongs to an image of another size.
 _OFF_CENTRE = 0.2
-# What the document is called, the second by MapAnything (WAI).
-_DOCUMENTS = ("transforms.json", "scene_meta.json")
+# What the document is called, the second by MapAnything (WAI); others call so what has no frames.
+_DOCUMENT, _OF_WAI = "transforms.json", "scene_meta.json"
+# A camera that could not be placed costs its frame, not the capture.
+_UNPLACED = ("transform_matrix",)
 beside_mesh = statements_beside
 
 
@@ -66,9 +67,25 @@ def matches(path: Path) -> bool:
     return document.suffix == ".json" and document.is_file()
 
 
+def is_surely(path: Path) -> bool:
+    """Whether it is a document with frames, or holds one: what nobody named may be called so."""
+    return _has_frames(_document(path))
+
+
 def _document(path: Path) -> Path:
-    inside = [path / name for name in _DOCUMENTS] if path.is_dir() else [path]
-    return next((file for file in inside if file.is_file()), inside[0])
+    if not path.is_dir():
+        return path
+    usual, of_wai = path / _DOCUMENT, path / _OF_WAI
+    return of_wai if not usual.is_file() and _has_frames(of_wai) else usual
+
+
+def _has_frames(document: Path) -> bool:
+    try:
+        said = read_json(document, nonfinite_below=_UNPLACED)
+    except InputRefused:
+        return False
+    frames = said.get("frames") if isinstance(said, dict) else None
+    return isinstance(frames, list) and len(frames) > 0
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:
@@ -104,7 +121,7 @@ def _geometry(capture: _Capture, findings: Findings) -> ScanGeometry:
     """Of the mesh that the document names, else mesh.ply beside it, else the only one there."""
     options, root = capture.options, capture.source.parent
     mesh = options.mesh or _beside(capture, "mesh", "mesh.ply")
-    if capture.document.get("mesh") in capture.pictured.moved and options.mesh is None:
+    if options.mesh is None and capture.document.get("mesh") in capture.pictured.moved:
         findings.warn(
             f"{capture.source.name}: its mesh lies elsewhere, as before the capture was moved; "
             f"{str(mesh)!r} is taken. [capture.moved]"
@@ -249,8 +266,7 @@ def _captured(
             f"{source}: belongs to the scene of ScanNet++ in {scene}, whose mesh has other axes "
             "than its poses. Name that folder. [capture.format]"
         )
-    # A camera that could not be placed costs its frame, not the capture.
-    document = read_json(source, nonfinite_below=("transform_matrix",))
+    document = read_json(source, nonfinite_below=_UNPLACED)
     frames = document.get("frames") if isinstance(document, dict) else None
     # ScanNet++ keeps those that it tests with, and says which are blurred.
     tested = document.get(TESTED, []) if isinstance(frames, list) else None
@@ -275,14 +291,29 @@ def _captured(
         masks=images and not in_scene,
         is_legacy=has_old_axes(source, document, frames, findings, in_scene=in_scene),
     )
-    warn_of_conventions(document, source, findings)
+    warn_of_conventions(document, frames, source, findings)
     if any(any(rolling_shutter(frame)) for frame in (document, *frames)):
         warn_of_rolling_shutter(source, findings)
     sound = [(i, frame) for i, frame in enumerate(frames) if not is_bad(frame)]
     warn_of_bad(len(frames) - len(sound), len(frames), source.name, findings)
     records = [r for i, frame in sound if (r := _record(capture, frame, i, findings))]
     capture.pictured.warn_of_others(findings, source)
+    _refuse_pictures_as_masks(capture, records)
     return capture, records
+
+
+def _refuse_pictures_as_masks(capture: _Capture, records: Sequence[FrameRecord]) -> None:
+    """InputRefused where what was found at the end of a mask's path is a picture of a frame."""
+    found = set(capture.pictured.moved.values())
+    pictures = {*capture.pictured.instead, *(record.image_path for record in records)}
+    for record in records:
+        if record.mask_path in found & pictures:
+            raise capture.refuse(
+                f"the mask_path of the frame {record.name!r} leads elsewhere, where nothing is, "
+                f"and what is found by its end, {str(record.mask_path)!r}, is a picture of a "
+                "frame. Bring the masks too, or remove the key.",
+                "capture.mask",
+            )
 
 
 def _record(
@@ -336,15 +367,16 @@ def _record(
         if why:
             findings.drop(name, why, "capture.size")
             return None
+    intrinsics = _intrinsics(capture, frame, name, lens, width, height)
     return FrameRecord(
         name=name,
         image_path=path,
         world_from_camera=capture.applied.undone(pose @ camera_axes(capture.document)),
         captured_pose=_captured_pose(capture, frame, name),
-        intrinsics=_intrinsics(capture, frame, name, lens, width, height),
+        intrinsics=intrinsics,
         resolution=(width, height),
         size_of_image=not stated,
-        lens=lens,
+        lens=with_skew(lens, partial(capture.number, frame), intrinsics[0]),
         mask_path=_mask(capture, frame, name),
         exposure_time=capture.positive(frame, "exposure_time") or 1.0,
         saturation_radiance=capture.positive(frame, "saturation_radiance") or math.inf,
@@ -370,8 +402,10 @@ def _intrinsics(
 ) -> tuple[float, float, float, float]:
     if lens.curve == "equirectangular":
         return whole_sphere(width, height)
-    fx = capture.positive(frame, "fl_x") or _of_angles(capture, frame, "x", width)
-    fy = capture.positive(frame, "fl_y") or _of_angles(capture, frame, "y", height)
+    number = partial(capture.positive, frame)
+    refuse = partial(capture.refuse, rule="capture.camera")
+    fx = number("fl_x") or focal_of_angle(number, refuse, "x", width)
+    fy = number("fl_y") or focal_of_angle(number, refuse, "y", height)
     if fx is None:
         raise capture.refuse(
             f"the frame {name!r} has neither fl_x nor camera_angle_x. State the focal length in "
@@ -380,26 +414,6 @@ def _intrinsics(
         )
     cx, cy = capture.number(frame, "cx"), capture.number(frame, "cy")
     return fx, fy or fx, width / 2 if cx is None else cx, height / 2 if cy is None else cy
-
-
-def _of_angles(capture: _Capture, frame: Mapping[str, Any], axis: str, size: float) -> float | None:
-    """The focal length in pixels of an image that is as wide as an angle, of the two that documents
-    have for it, the second instant-ngp's; None without either."""
-    for key, half_turn, unit in (
-        (f"camera_angle_{axis}", math.pi, "radians"),
-        (f"{axis}_fov", 180.0, "degrees"),
-    ):
-        angle = capture.positive(frame, key)
-        if angle is not None and angle >= half_turn:
-            # Its tangent may be that of another angle altogether.
-            raise capture.refuse(
-                f"{key} is {angle:g}, but it is in {unit}, below {half_turn:.4g}. Correct it, or "
-                "state the focal length in pixels.",
-                "capture.camera",
-            )
-        if angle is not None:
-            return size / (2 * math.tan(angle / half_turn * math.pi / 2))
-    return None
 
 
 def _why_of_another_size(
@@ -448,7 +462,8 @@ def _mask(capture: _Capture, frame: Mapping[str, Any], name: str) -> Path | None
             "it has none.",
             "capture.mask",
         )
-    return capture.pictured.file(mask)
+    # Its name alone is the photograph's as often as not.
+    return capture.pictured.file(mask, fewest=2)
 
 
 def _beside(capture: _Capture, key: str, usual: str) -> Path:

@@ -22,13 +22,13 @@ from usdbrdf.capture.formats.named_pictures import (
     Pictures,
     drop_without_picture,
     nearest_to_radiance,
-    path_in_capture,
     pictures_of,
     refuse_without_pictures,
     scan_of,
     warn_of_radiance,
     warn_of_unused,
 )
+from usdbrdf.capture.mesh_frames import path_in_capture
 from usdbrdf.capture.parts import geometry_from_file, geometry_from_usd
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size

@@ -19,7 +19,7 @@ from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.camera_checks import warn_of_rolling_shutter
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.conventions import opengl_from_opencv
-from usdbrdf.capture.formats.named_pictures import path_in_capture
+from usdbrdf.capture.mesh_frames import path_in_capture
 from usdbrdf.capture.reconstructions.shots import Shot, ShotCamera, rows_of, scan_of_shots
 from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused

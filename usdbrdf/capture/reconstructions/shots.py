@@ -14,14 +14,13 @@ from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     drop_without_picture,
-    path_in_capture,
     pictures_of,
     refuse_without_pictures,
     scan_of,
     warn_of_radiance,
     warn_of_unused,
 )
-from usdbrdf.capture.mesh_frames import mesh_beside
+from usdbrdf.capture.mesh_frames import mesh_beside, path_in_capture
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing
