@@ -226,6 +226,32 @@ def test_a_part_of_a_capture_names_the_folder_to_ask_for(tmp_path, monkeypatch, 
         choose_adapter(Path())
 
 
+@pytest.mark.parametrize(
+    ("name", "text"), [("scene.usda", "#usda 1.0\n"), ("transforms.json", "{}"), ("shot.abc", "")]
+)
+def test_what_lies_above_by_chance_is_no_capture_to_ask_for(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures/0001.jpg").write_bytes(b"")
+    assert "nothing known here says where the cameras stood" in _refused(tmp_path / "pictures")
+
+
+def test_folders_above_that_nobody_named_are_passed_over_where_they_cannot_be_read(
+    tmp_path, monkeypatch
+):
+    """Their permissions were told of, not what is wrong with the folder that was named."""
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures/0001.jpg").write_bytes(b"")
+
+    def denied(path):
+        if path == tmp_path:
+            raise PermissionError(13, "Permission denied", str(path))
+        return False
+
+    monkeypatch.setattr("usdbrdf.capture.formats.metashape.matches", denied)
+    assert "nothing known here says where the cameras stood" in _refused(tmp_path / "pictures")
+
+
 def test_a_stage_whose_prims_are_called_as_a_programs_words_is_none_of_its_documents(tmp_path):
     (tmp_path / "geo.usda").write_text('#usda 1.0\ndef Xform "geo"\n{\n}\n')
     (tmp_path / "shot.usda").write_text('#usda 1.0\ndef Xform "shots"\n{\n}\n')

@@ -9,6 +9,7 @@ USD.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
@@ -84,6 +85,8 @@ DESCRIPTIONS = {
 
 
 GROUP = "usdbrdf.adapters"
+# Files of these need not be captures.
+_OF_ANY_SCENE = ("usd", "alembic")
 # Folders in a folder that are asked, where it is no capture itself.
 _MOST_BELOW = 100
 
@@ -183,7 +186,7 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
 
     with environment_failures(str(path)):
         below = next(_recognised_below(path, sound), None)
-        above = next(_recognised_above(path, sound), None)
+        above = None if below else next(_recognised_above(path, sound), None)
         said = (
             f"no capture itself, but {below[0].as_posix()}/ in it is one ({below[1].name}). Name "
             "that folder"
@@ -208,11 +211,15 @@ def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, 
 
 
 def _recognised_above(path: Path, sound: list[Adapter]) -> Iterator[Path]:
-    """Folders that it lies in, two at most, that one of our adapters recognises."""
+    """Folders that it lies in, two at most, that one of our adapters recognises for sure. Nobody
+    named them: what may not be read there is passed over."""
+    ours = (a for a in sound if a.name in MODULES and a.name not in _OF_ANY_SCENE)
+    looks = [getattr(a.module, "is_surely", None) or a.module.matches for a in ours if a.module]
     for folder in path.absolute().parents[:2]:
-        ours = (a.module for a in sound if a.module and a.name in MODULES)
-        if any(module.matches(folder) for module in ours):
-            yield folder
+        for look in looks:
+            with suppress(OSError, UsdBrdfError):
+                if look(folder):
+                    yield folder
 
 
 def refuse_missing(path: Path) -> None:
