@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, ParamSpec
 
 from usdbrdf.asset.adopt import adopt, is_damaged
-from usdbrdf.asset.layers.interface import mend_root
+from usdbrdf.asset.layers.interface import is_cut, mend_root
 from usdbrdf.asset.layers.scan_layer import is_edited
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import warn_of_edits
@@ -125,9 +125,6 @@ def working_on(
         damaged = [file for file in changed if is_damaged(asset.folder / file)]
         for file in damaged:
             warn(f"{asset.folder / file}: damaged; it is made again. [layer.damaged]")
-        with environment_failures(str(asset.root_layer)):
-            if mend_root(asset):
-                warn(f"{asset.root_layer}: cut off; it is written again. [layer.damaged]")
         edited = [file for file in changed if file not in damaged]
         if edited and hand_edits == "refuse":
             raise OwnershipConflict(
@@ -140,9 +137,21 @@ def working_on(
                 copies = adopt(asset, [asset.folder / file for file in edited])
             for copy in copies:
                 say(f"{copy}: keeps what was changed by hand; add it to edits.usda to use it")
+        _mend_root(asset, changed)
         yield asset
         if known_hashes(state) != before and is_edited(made := Asset.at(asset.folder)):
             warn_of_edits(made)
+
+
+def _mend_root(asset: Asset, changed: Sequence[str]) -> None:
+    """Have the root layer of which nothing is left written again, if not by the scan layer, which
+    is damaged, edited or gone with it, by ingest, which writes both."""
+    with environment_failures(str(asset.root_layer)):
+        if is_cut(asset.root_layer):
+            scan = asset.layer("scan")
+            is_own = scan.is_file() and scan.relative_to(asset.folder).as_posix() not in changed
+            mend_root(asset, by_scan=is_own and not is_damaged(scan))
+            warn(f"{asset.root_layer}: cut off; it is written again. [layer.damaged]")
 
 
 def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:

@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from tests.nondestruction.conftest import COARSE, bytes_of, convert
-from usdbrdf.asset.layers.interface import mend_root
+from usdbrdf.asset.layers.interface import is_cut, mend_root
 from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
 
@@ -60,19 +60,47 @@ def test_a_root_of_which_no_more_than_its_first_line_is_left_is_written_again(
 ):
     """Nobody's work is in it, and USD takes it for a stage: nothing else would be told."""
     root, whole = copied / "room.usda", (converted.folder / "room.usda").read_bytes()
-    for rest in (b"#usda 1.0\n", b"#usda 1.0", b"", bytes(512)):
+    for rest in (b"#usda 1.0\n", b"#usda 1.0", b"#us", b"", bytes(512)):
         root.write_bytes(rest)
-        assert mend_root(Asset.at(copied))
-        assert root.read_bytes() == whole
-    theirs = b"#usda 1.0\n# the artist's\n"
-    root.write_bytes(theirs)
-    assert not mend_root(Asset.at(copied))
-    assert root.read_bytes() == theirs
+        assert is_cut(root)
+    mend_root(Asset.at(copied), by_scan=True)
+    assert root.read_bytes() == whole
+    root.write_bytes(b"#usda 1.0\n# the artist's\n")
+    assert not is_cut(root)
+    root.unlink()
+    (copied / "theirs.usda").touch()
+    root.symlink_to("theirs.usda")
+    assert not is_cut(root)
+    root.unlink()
+    (copied / "theirs.usda").unlink()
     root.write_bytes(whole[:10])
     loud = [option for option in COARSE if option != "-q"]
     assert main(["convert", str(capture), "-o", str(copied), *loud]) == 0
     assert "room.usda: cut off; it is written again" in capsys.readouterr().err
     assert bytes_of(copied) == bytes_of(converted.folder)
+
+
+@pytest.mark.parametrize("scan", ["damaged", "missing"])
+def test_a_cut_root_is_made_again_with_its_scan(capture, converted, copied, scan):
+    """Neither could be made again without the other."""
+    (copied / "room.usda").write_bytes(b"#usda")
+    if scan == "damaged":
+        cut(copied / "layers/scan.usdc")
+    else:
+        (copied / "layers/scan.usdc").unlink()
+    convert(capture, copied)
+    assert (copied / "room.usda").read_bytes() == (converted.folder / "room.usda").read_bytes()
+    for part in PARTS:
+        assert bytes_of(copied / part) == bytes_of(converted.folder / part)
+
+
+def test_a_run_that_is_refused_leaves_a_cut_root_as_it_is(capture, copied):
+    (copied / "room.usda").write_bytes(b"#usda 1.0\n")
+    with (copied / "layers/material.usda").open("a") as layer:
+        layer.write("# by hand\n")
+    before = bytes_of(copied)
+    assert main(["convert", str(capture), "-o", str(copied), *COARSE]) == 6
+    assert bytes_of(copied) == before
 
 
 def test_a_damaged_scan_is_made_again_with_other_options(capture, converted, copied):

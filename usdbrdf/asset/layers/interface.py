@@ -30,7 +30,7 @@ from usdbrdf.asset.header import (
 from usdbrdf.asset.layers.author import apply_schema, attribute, define, export, over
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.atomic import publish, temporary_beside
+from usdbrdf.files.atomic import flush_folder, publish, temporary_beside
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.capture import Scan
@@ -41,6 +41,7 @@ Types = Sdf.ValueTypeNames
 UNPUBLISHED = "work"
 # Bytes of a root layer that was cut off at its beginning: a block of a disk.
 _LONGEST_REST = 4096
+_FIRST_LINE = b"#usda 1.0"
 # Pivots lie on a grid of binary fractions of the unit: what is moved by them keeps its digits.
 _PER_UNIT = 1024
 # An abstract prim that a shot may define, to say something of all copies of an asset at once.
@@ -102,8 +103,9 @@ def components_of(scan: Scan) -> tuple[Component, ...]:
 
 
 def write_root(path: Path, asset: Asset, header: StageHeader, capture_up: str = "") -> None:
-    """NAME.usda: the artist's layer, the interfaces, strongest first, and the payload. Written
-    once, never again; so it notes from which axis up the capture was turned, too."""
+    """NAME.usda: the artist's layer, the interfaces, strongest first, and the payload. Never
+    written over while anything is left of it; so it notes from which axis up the capture was
+    turned, too."""
     provenance = Provenance(role="root", version=LAYOUT)
     layer = new_layer(header, provenance, capture_up=capture_up or None)
     layer.documentation = (
@@ -124,18 +126,26 @@ def write_root(path: Path, asset: Asset, header: StageHeader, capture_up: str = 
     export(layer, path, folder=asset.folder)
 
 
-def mend_root(asset: Asset) -> bool:
-    """Write the root layer again of which nothing is left but USD's first line, or zeros: a copy
-    or a disk stopped there, and it shows an empty stage. All that has more in it is kept."""
-    root, scan = asset.root_layer, asset.layer("scan")
-    if not (root.is_file() and scan.is_file() and root.stat().st_size <= _LONGEST_REST):
+def is_cut(root: Path) -> bool:
+    """Whether nothing is left of a root layer but USD's first line, of that a part, or zeros: a
+    copy or a disk stopped there. USD may take it for a stage, an empty one. All that has more in it
+    is kept, and a link leads to somebody else's."""
+    if root.is_symlink() or not root.is_file() or root.stat().st_size > _LONGEST_REST:
         return False
-    if root.read_bytes().strip(b"\0 \r\n") not in (b"", b"#usda 1.0"):
-        return False
+    return _FIRST_LINE.startswith(root.read_bytes().strip(b"\0 \r\n"))
+
+
+def mend_root(asset: Asset, *, by_scan: bool) -> None:
+    """Write the root layer again of which nothing is left, as the scan layer says if it is sound;
+    else remove it, so that ingest writes it with that."""
+    root = asset.root_layer
+    if not by_scan:
+        root.unlink()
+        flush_folder(root.parent)
+        return
     with temporary_beside(root) as staged:
-        write_root(staged, asset, read_header(scan), capture_up_of(asset))
+        write_root(staged, asset, read_header(asset.layer("scan")), capture_up_of(asset))
         publish(staged, root)
-    return True
 
 
 def write_contents(path: Path, asset: Asset, header: StageHeader) -> None:
