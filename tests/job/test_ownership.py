@@ -368,6 +368,44 @@ def test_an_asset_that_lost_the_record_of_its_maker_is_known_by_its_steps(tmp_pa
         own(tmp_path / "room")
 
 
+@pytest.mark.parametrize("name", ["layers/material.usda", "layers/toy.usda", "textures/mine.exr"])
+def test_without_the_record_of_its_maker_a_file_of_anothers_is_not_written_over(
+    tmp_path, toy, name
+):
+    """One stamp that could be read was enough."""
+    toy.run_toy(tmp_path / "room")
+    (tmp_path / "room/.usdbrdf/job.json").unlink()
+    (tmp_path / "room/layers/.DS_Store").touch()
+    (tmp_path / "room" / name).write_text("#usda 1.0\n# theirs\n")
+    before = names_in(tmp_path / "room")
+    with pytest.raises(OwnershipConflict, match=rf"{name} is not as .+\[ownership.foreign\]"):
+        own(tmp_path / "room")
+    assert names_in(tmp_path / "room") == before
+    (tmp_path / "room" / name).unlink()
+    own(tmp_path / "room")
+
+
+def test_a_journal_alone_does_not_make_a_folder_ours(tmp_path, toy):
+    toy.run_toy(tmp_path / "room")
+    state = tmp_path / "room/.usdbrdf"
+    (state / "job.json").unlink()
+    next(state.glob("stamps/*.json")).rename(state / "publishing-toy.json")
+    with pytest.raises(OwnershipConflict, match=r"hidden folder \.usdbrdf.+\[ownership.foreign\]"):
+        own(tmp_path / "room")
+
+
+def test_a_link_to_nothing_in_the_place_of_a_folder_of_ours_is_named(tmp_path, toy):
+    """A folder in it may be called anything, though."""
+    toy.run_toy(tmp_path / "room")
+    cache = tmp_path / "room/.usdbrdf/cache"
+    (cache / "any").mkdir()
+    own(tmp_path / "room")
+    shutil.rmtree(cache)
+    cache.symlink_to("gone")
+    with pytest.raises(OwnershipConflict, match=rf"{cache}: this is no folder.+ownership.place"):
+        own(tmp_path / "room")
+
+
 @pytest.mark.parametrize("name", ["lock", "job.json", "stamps", "work", "cache"])
 def test_what_lies_in_the_place_of_our_state_is_named(tmp_path, toy, name):
     toy.run_toy(tmp_path / "room")

@@ -68,16 +68,22 @@ def inside(root: Path, place: Path) -> Path:
     return place
 
 
-def refuse_misplaced(root: Path, files: Iterable[Path]) -> None:
-    """OwnershipConflict where a folder lies in the place of a file of ours below ``root``, or a
-    file in that of a folder: putting files in place would stop there each time, with some of them
-    of another run."""
+def refuse_misplaced(root: Path, files: Iterable[Path], folders: Iterable[Path] = ()) -> None:
+    """OwnershipConflict where a folder lies in the place of a file of ours below ``root``, or
+    something else, a link to nothing too, in that of one of ``folders`` or of a folder above:
+    putting files in place would stop there each time, with some of them of another run."""
+
+    def refuse_no_folder(places: Iterable[Path]) -> None:
+        for place in (place for place in places if place.is_relative_to(root)):
+            if os.path.lexists(place) and not place.is_dir():
+                raise misplaced(place, "no folder", "folder")
+
     for file in files:
-        above = [folder for folder in file.parents if folder.is_relative_to(root)]
-        wrong = [file] if file.is_dir() else [f for f in above if f.exists() and not f.is_dir()]
-        for place in wrong:
-            found, wanted = ("a folder", "file") if place == file else ("no folder", "folder")
-            raise misplaced(place, found, wanted)
+        if file.is_dir():
+            raise misplaced(file, "a folder")
+        refuse_no_folder(file.parents)
+    for folder in folders:
+        refuse_no_folder((folder, *folder.parents))
 
 
 def misplaced(place: Path, found: str, wanted: str = "file") -> OwnershipConflict:

@@ -23,8 +23,8 @@ from typing import ParamSpec, TypeVar
 from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, NoLocks, OwnershipConflict
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, flush_folder, sha256_of
 from usdbrdf.files.documents import read_json, write_json
-from usdbrdf.files.paths import inside, misplaced, refuse_misplaced
-from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
+from usdbrdf.files.paths import files_below, inside, misplaced, refuse_misplaced
+from usdbrdf.job.stamp import STATE_FOLDER, known_hashes, read_stamp
 
 _POLL_SECONDS = 0.2
 _UNSIGNED = "another run, which reads it or has not signed yet"
@@ -274,14 +274,16 @@ def _wait_or_refuse(path: Path, deadline: float, holder: str) -> None:
 
 
 JOB_SCHEMA = 1
+# Folders of an asset in which steps put files that they may replace.
+_WRITTEN = ("layers", "textures")
 
 
 @contextmanager
 def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False) -> Iterator[Path]:
     """Make or accept an output folder and hold its lock; gives its state folder ``.usdbrdf``.
 
-    A folder with files in it, no ``.usdbrdf/job.json`` and no record of a step is somebody else's:
-    OwnershipConflict.
+    A folder with files in it, no ``.usdbrdf/job.json`` and no records of steps that left all of its
+    layers and textures is somebody else's: OwnershipConflict.
     Where nothing can be written: EnvironmentFailure. For FolderBusy and the options see
     ``folder_lock``. Where the work fails before anything is published, the folders that this call
     made are removed again, and nothing of another run.
@@ -302,7 +304,7 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
                     raise
             held.enter_context(_removed_if_unused(asset, made))
             record, folders = state / "job.json", ("stamps", "work", "cache")
-            refuse_misplaced(asset, [record, *(state / name / "any" for name in folders)])
+            refuse_misplaced(asset, [record], [state / name for name in folders])
             try:
                 document = read_json(record)
                 schema = document.get("schema") if isinstance(document, dict) else None
@@ -365,9 +367,11 @@ def _accepted(asset: Path, made: list[Path]) -> Path:
         entry.name in ("stamps", "work", "cache", "lock") or entry.name.startswith(TEMPORARY_PREFIX)
         for entry in state.iterdir()
     )
-    # A record of ours that a step left tells as much.
-    ours = begun or (state / "job.json").is_file() or bool(known_hashes(state))
-    if entries and not ours:
+    ours = begun or (state / "job.json").is_file()
+    # Records that steps of ours left tell as much, if they are of what lies here.
+    if entries and not ours and any(map(read_stamp, state.glob("stamps/*.json"))):
+        _refuse_what_no_step_left(asset)
+    elif entries and not ours:
         raise OwnershipConflict(
             f"{asset}: the folder is not empty and was not made by usdbrdf, or came without its "
             f"hidden folder {STATE_FOLDER}, which tells so. Bring that from where it was copied, "
@@ -381,6 +385,23 @@ def _accepted(asset: Path, made: list[Path]) -> Path:
                 folder.mkdir()
                 made.insert(0, folder)
     return state
+
+
+def _refuse_what_no_step_left(asset: Path) -> None:
+    """OwnershipConflict where a folder that only stamps call ours holds a layer or a texture that
+    is not as a step left it: it may be somebody else's, beside stamps that came by a copy."""
+    state = asset / STATE_FOLDER
+    known = known_hashes(state)
+    places = (folder for name in _WRITTEN if (folder := asset / name).is_dir())
+    for file in (file for folder in places for file in files_below(folder, without=state)):
+        relative = file.relative_to(asset).as_posix()
+        is_litter = file.name.startswith(TEMPORARY_PREFIX)
+        if not is_litter and sha256_of(file) not in known.get(relative, ()):
+            raise OwnershipConflict(
+                f"{asset}: {relative} is not as usdbrdf left it, and {STATE_FOLDER}/job.json is "
+                "missing, which tells whose folder this is. Bring that from where it was copied, "
+                "move the file away, or name a new or empty folder. [ownership.foreign]"
+            )
 
 
 @contextmanager
