@@ -59,6 +59,10 @@ def fill_disk(arrays, parameters):
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     return {"a": np.zeros(9)}
 
+def open_too_many(arrays, parameters):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+    raise ValueError("of another kind")
+
 def leave(arrays, parameters):
     print("no memory for a thread", file=sys.stderr, flush=True)
     os._exit(1)
@@ -157,6 +161,11 @@ def test_a_child_whose_disk_is_full_says_which(child, tmp_path, monkeypatch):
     expected = rf"^unwrap of <chair>: .+ written into {tmp_path}, .+TMPDIR.+\[environment\.io\]$"
     with pytest.raises(EnvironmentFailure, match=expected):
         child("fill_disk")
+
+
+def test_a_child_that_may_open_no_file_is_not_told_to_free_disk_space(child):
+    with pytest.raises(EnvironmentFailure, match=r"Too many open files.+\[child\.start\]$"):
+        child("open_too_many")
 
 
 def test_hang_is_stopped_with_all_that_it_started(child, tmp_path, monkeypatch):

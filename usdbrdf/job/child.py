@@ -9,6 +9,7 @@ behind go at the next one. The child dies with us.
 from __future__ import annotations
 
 import ctypes
+import errno
 import json
 import math
 import os
@@ -37,6 +38,8 @@ _START = "from usdbrdf.job.child import main; main()"
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 # Exit statuses of a child that left an error.json, and of one for which its disk had no room.
 _ERROR_TOLD, _ERROR_UNTOLD = 97, 98
+# What a disk says on which nothing can be written.
+_NO_PLACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 _GRACE_SECONDS = 10  # the child's own alarm, should we die before we can end it
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _ERROR_CLASSES = {
@@ -216,7 +219,9 @@ def main() -> None:
         told = {"class": name, "message": message, "traceback": traceback.format_exc()}
         try:
             (folder / "error.json").write_text(json.dumps(told), "utf-8")
-        except OSError:
+        except OSError as failure:
+            if failure.errno not in _NO_PLACE:
+                raise
             _leave(_ERROR_UNTOLD)
         _leave(_ERROR_TOLD)
     _leave(0)
