@@ -285,6 +285,8 @@ _AS_SRGB, _LINEAR = (b"gAMA", struct.pack(">I", 45455)), (b"gAMA", struct.pack("
         ([(b"sRGB", b"\0"), _AS_SRGB, _OF_P3], "srgb_rec709_scene"),
         ([_AS_SRGB, _OF_2020], None),
         ([(b"cHRM", b"short")], "srgb_rec709_scene"),
+        ([(b"eXIf", b"MM\0*" + bytes(70_000)), _AS_SRGB, _OF_P3], "srgb_p3d65_scene"),
+        ([(b"tEXt", b"Comment\0" + b"a" * 200_000), _OF_P3], "srgb_p3d65_scene"),
     ],
 )
 def test_a_png_has_the_primaries_that_it_states(tmp_path, chunks, known):

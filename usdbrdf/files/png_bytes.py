@@ -3,14 +3,17 @@ Rec.709, whatever primaries are in the file."""
 
 from __future__ import annotations
 
+import os
 import struct
 from pathlib import Path
 
+from usdbrdf.files.atomic import raise_shortage
 from usdbrdf.files.colour import space_of_primaries
 from usdbrdf.files.tables import beginning_of
 
 _MARK = b"\x89PNG\r\n\x1a\n"
-_HEAD = 1 << 16  # bytes, in which all that is asked for stands before the pixels
+# Bytes of chunks that are asked for, and chunks before the pixels: in no sound file are there more.
+_LONGEST, _MOST_CHUNKS = 64, 10_000
 # What comes before numbers (PNG, third edition, 4.3).
 _STRONGER = frozenset((b"cICP", b"iCCP", b"sRGB"))
 _SRGB_GAMMA, _LINEAR_GAMMA = 45455, 100000
@@ -20,8 +23,7 @@ _CURVED = {"lin_p3d65_scene": "srgb_p3d65_scene", "lin_adobergb_scene": "g22_ado
 def space_by_chunks(path: Path) -> str:
     """The name of the space by cHRM and gAMA, or what they say of one without a name; "" where they
     say nothing, or Rec.709's primaries, and of what is no PNG."""
-    head = beginning_of(path, _HEAD)
-    chunks = _chunks(head) if head.startswith(_MARK) else {}
+    chunks = _chunks(path)
     stated = chunks.get(b"cHRM", b"")
     if len(stated) != 32 or _STRONGER & chunks.keys():
         return ""
@@ -40,14 +42,24 @@ def space_by_chunks(path: Path) -> str:
     return f"primaries and white {shown} with a gamma of {power / 1e5:.4g}"
 
 
-def _chunks(head: bytes) -> dict[bytes, bytes]:
-    """The chunks before the pixels, by their names."""
+def _chunks(path: Path) -> dict[bytes, bytes]:
+    """The chunks of a PNG before its pixels, by their names, with the data of what is short: text
+    and EXIF before them may be long. None of what is no PNG, or cannot be read."""
     found: dict[bytes, bytes] = {}
-    at = len(_MARK)
-    while at + 8 <= len(head):
-        length, name = struct.unpack_from(">I4s", head, at)
-        if name == b"IDAT":
-            break
-        found.setdefault(name, head[at + 8 : at + 8 + length])
-        at += 12 + length
+    if beginning_of(path, len(_MARK)) != _MARK:
+        return found
+    try:
+        with path.open("rb") as file:
+            file.seek(len(_MARK))
+            for _ in range(_MOST_CHUNKS):
+                head = file.read(8)
+                if len(head) < 8 or head[4:] == b"IDAT":
+                    break
+                length, name = struct.unpack(">I4s", head)
+                data = file.read(length) if length <= _LONGEST else b""
+                found.setdefault(name, data)
+                file.seek(length - len(data) + 4, os.SEEK_CUR)
+    except OSError as error:
+        raise_shortage(error)
+        return {}
     return found
