@@ -129,6 +129,21 @@ def test_a_rolling_shutter_is_told(project, place, text, told):
     assert [s for s in findings.warnings if "[capture.shutter]" in s] == findings.warnings[:told]
 
 
+@pytest.mark.parametrize("unused", ["sensor", "camera"])
+def test_a_rolling_shutter_of_what_is_not_used_is_not_told(project, unused):
+    document = ET.parse(project / "cameras.xml")
+    if unused == "sensor":
+        holder = _child(document.getroot().find(".//sensors"), "sensor", id="9")
+    else:
+        holder = document.getroot().find(".//camera")
+        holder.set("enabled", "false")
+    _child(holder, "rolling_shutter", "true")
+    document.write(project / "cameras.xml")
+    findings = Findings()
+    frame_records(project / "cameras.xml", pictures_of(project, OPTIONS), OPTIONS, findings)
+    assert not any("[capture.shutter]" in said for said in findings.warnings)
+
+
 def test_cameras_of_a_chunk(project, room):
     assert choose_adapter(project).name == "metashape"
     assert choose_adapter(project / "cameras.xml").name == "metashape"

@@ -129,8 +129,6 @@ def frame_records(
 ) -> list[FrameRecord]:
     """The cameras of a document that have a pose and a picture, by their labels."""
     chunk = _chunk(read_xml(source), source, findings)
-    if any(map(_moves_while_it_reads, chunk.iter())):
-        warn_of_rolling_shutter(source, findings)
     sensors = {s.get("id", ""): _sensor(s, source) for s in chunk.iterfind("sensors/sensor")}
     place_of = _places(chunk, source, findings)
     cameras = list(chunk.iterfind("cameras//camera"))
@@ -150,7 +148,7 @@ def frame_records(
         if (label := camera.get("label", ""))
     }
     cameras_of = Counter(picture_of.values())
-    records = []
+    used, records = [], []
     for camera in cameras:
         label = camera.get("label", "")
         if not _is_enabled(camera):
@@ -184,6 +182,7 @@ def frame_records(
             )
             findings.drop(label, said, "capture.label")
             continue
+        used.append(camera)
         pose = place.pose(master.reshape(4, 4) @ sensor.master_from_sensor)
         records.append(
             FrameRecord(
@@ -196,6 +195,10 @@ def frame_records(
                 mask_path=pictures.mask_of(image, source.parent, options),
             )
         )
+    used_sensors = {camera.get("sensor_id", "") for camera in used}
+    used += [s for s in chunk.iterfind("sensors/sensor") if s.get("id", "") in used_sensors]
+    if any(_moves_while_it_reads(part) for element in used for part in element.iter()):
+        warn_of_rolling_shutter(source, findings)
     return sorted(records, key=lambda record: record.image_path)
 
 
