@@ -3,6 +3,8 @@
 The importer keeps only attributes that are marked custom; those of a schema are not.
 """
 
+import math
+
 import bpy
 
 from . import usd_asset
@@ -11,6 +13,8 @@ from . import usd_asset
 # there are looks: the prim that has them, their names, and the one that is shown.
 FILE, PRIM = "usdbrdf_file", "usdbrdf_prim"
 ROOT, LOOKS, SHOWN = "usdbrdf_root", "usdbrdf_looks", "usdbrdf_look"
+# Times as strong as USD says are the importer's suns, of whatever kind.
+_TOO_STRONG = 4.0
 
 
 class UsdBrdfImport(bpy.types.USDHook):
@@ -23,6 +27,7 @@ class UsdBrdfImport(bpy.types.USDHook):
     def on_import(context):
         stage = context.get_stage()
         file = stage.GetRootLayer().realPath
+        dimmed = set()
         for path, imported in context.get_prim_map().items():
             prim = stage.GetPrimAtPath(path)
             # A package of ours has facts, and no looks to choose from.
@@ -36,7 +41,7 @@ class UsdBrdfImport(bpy.types.USDHook):
                 if isinstance(item, bpy.types.Object | bpy.types.Material):
                     item[FILE], item[PRIM] = file, str(path)
                 if isinstance(item, bpy.types.Object):
-                    _shine_as_told(item, prim)
+                    _shine_as_told(item, prim, dimmed)
                     for name, value in facts.items():
                         item[name] = value
                     if root is not None:
@@ -45,18 +50,15 @@ class UsdBrdfImport(bpy.types.USDHook):
         return True
 
 
-def _shine_as_told(item, prim):
-    """A sun: Blender makes it four times as strong as USD says."""
+def _shine_as_told(item, prim, dimmed):
+    """A sun: Blender's importer makes it four times as strong as USD and the user's
+    light_intensity_scale say, and twice as wide. ``dimmed`` has those that were put right."""
     if item.type != "LIGHT" or item.data.type != "SUN" or prim.GetTypeName() != "DistantLight":
         return
-    told = {
-        name: prim.GetAttribute(f"inputs:{name}").Get()
-        for name in ("intensity", "exposure", "normalize")
-    }
-    if told["normalize"]:  # irradiance then, which is what Blender means by energy
-        item.data.energy = told["intensity"] * 2 ** (told["exposure"] or 0)
-        if hasattr(item.data, "exposure"):
-            item.data.exposure = 0
+    if item.data.name not in dimmed:
+        dimmed.add(item.data.name)
+        item.data.energy /= _TOO_STRONG
+        item.data.angle = math.radians(prim.GetAttribute("inputs:angle").Get())
 
 
 def _name_as_object(item, prim):

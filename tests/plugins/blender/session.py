@@ -8,6 +8,7 @@ build of USD. The add-on lies where Blender installs extensions, and is enabled 
 
 import importlib
 import json
+import math
 import sys
 import time
 from types import SimpleNamespace
@@ -130,11 +131,22 @@ def plain_import(file):
     return {"properties": properties(), "surfaces": surfaces()}
 
 
-def suns(file):
-    """Irradiance of each sun after Blender's own import, with the add-on enabled."""
-    plain_import(file)
-    lights = [item.data for item in bpy.data.objects if item.type == "LIGHT"]
-    return [light.energy * 2 ** getattr(light, "exposure", 0) for light in lights]
+def suns(file, scale):
+    """Strength of each sun, its angle in degrees and whether that is irradiance, after Blender's
+    own import, with the add-on enabled."""
+    enable()
+    empty_scene()
+    bpy.ops.wm.usd_import(filepath=file, light_intensity_scale=float(scale))
+    items = sorted(bpy.data.objects, key=lambda item: item.name)
+    lights = [item.data for item in items if item.type == "LIGHT"]
+    return [
+        (
+            light.energy * 2 ** getattr(light, "exposure", 0),
+            math.degrees(light.angle),
+            getattr(light, "normalize", True),
+        )
+        for light in lights
+    ]
 
 
 def package(file):

@@ -302,17 +302,22 @@ def test_blender_builds_the_extension(source, tmp_path):
         assert {"__init__.py", "blender_manifest.toml"} <= set(archive.namelist())
 
 
-def test_a_sun_is_as_strong_as_the_asset_says(session, room, tmp_path):
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_a_sun_is_as_strong_and_as_wide_as_the_asset_says(session, room, tmp_path, scale):
+    """One that states its irradiance and one that states its radiance: Blender, too, has both."""
     layer = Sdf.Layer.CreateNew(str(tmp_path / "sun.usda"))
     layer.subLayerPaths = [str(room)]
     layer.defaultPrim = Sdf.Layer.FindOrOpen(str(room)).defaultPrim
-    sun = Sdf.CreatePrimInLayer(layer, f"/{layer.defaultPrim}/sun")
-    sun.specifier, sun.typeName = Sdf.SpecifierDef, "DistantLight"
-    for name, kind, value in (
-        ("intensity", Sdf.ValueTypeNames.Float, 1.0),
-        ("exposure", Sdf.ValueTypeNames.Float, 2.0),
-        ("normalize", Sdf.ValueTypeNames.Bool, True),
-    ):
-        Sdf.AttributeSpec(sun, f"inputs:{name}", kind).default = value
+    for prim, normalize in (("sun_a", True), ("sun_b", False)):
+        sun = Sdf.CreatePrimInLayer(layer, f"/{layer.defaultPrim}/{prim}")
+        sun.specifier, sun.typeName = Sdf.SpecifierDef, "DistantLight"
+        for name, kind, value in (
+            ("intensity", Sdf.ValueTypeNames.Float, 1.0),
+            ("exposure", Sdf.ValueTypeNames.Float, 2.0),
+            ("angle", Sdf.ValueTypeNames.Float, 10.0),
+            ("normalize", Sdf.ValueTypeNames.Bool, normalize),
+        ):
+            Sdf.AttributeSpec(sun, f"inputs:{name}", kind).default = value
     layer.Save()
-    assert session("suns", layer.realPath) == [pytest.approx(4.0)]
+    of_both = [pytest.approx(4.0 * scale), pytest.approx(10.0)]
+    assert session("suns", layer.realPath, str(scale)) == [[*of_both, True], [*of_both, False]]
