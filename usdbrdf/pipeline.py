@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, ParamSpec
 
 from usdbrdf.asset.adopt import adopt, is_damaged
-from usdbrdf.asset.layers.interface import is_cut, mend_root
+from usdbrdf.asset.layers.interface import cut_root_aside, is_cut, mend_root
 from usdbrdf.asset.layers.scan_layer import is_edited
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import warn_of_edits
@@ -39,7 +39,7 @@ from usdbrdf.job.progress import say, warn
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.job.task import TaskResult
 from usdbrdf.job.units import HERE, Workers
-from usdbrdf.options import ConvertOptions, HandEdits, ShadeOptions, TextureOptions
+from usdbrdf.options import ConvertOptions, HandEdits, IngestOptions, ShadeOptions, TextureOptions
 from usdbrdf.tasks.fit import fit as fit_task
 from usdbrdf.tasks.fit import refuse_one_frame
 from usdbrdf.tasks.ingest import ingest as ingest_task
@@ -144,14 +144,19 @@ def working_on(
 
 
 def _mend_root(asset: Asset, changed: Sequence[str]) -> None:
-    """Have the root layer of which nothing is left written again, if not by the scan layer, which
-    is damaged, edited or gone with it, by ingest, which writes both."""
+    """Have the root layer of which nothing is left written again, if the scan layer is sound and as
+    it was written; else ingest writes both."""
+    scan = asset.layer("scan")
     with environment_failures(str(asset.root_layer)):
-        if is_cut(asset.root_layer):
-            scan = asset.layer("scan")
-            is_own = scan.is_file() and scan.relative_to(asset.folder).as_posix() not in changed
-            mend_root(asset, by_scan=is_own and not is_damaged(scan))
-            warn(f"{asset.root_layer}: cut off; it is written again. [layer.damaged]")
+        if not (is_cut(asset.root_layer) and scan.is_file()):
+            return
+        if scan.relative_to(asset.folder).as_posix() not in changed and not is_damaged(scan):
+            mend_root(asset)
+            _warn_of_cut(asset)
+
+
+def _warn_of_cut(asset: Asset) -> None:
+    warn(f"{asset.root_layer}: cut off; it is written again. [layer.damaged]")
 
 
 def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
@@ -169,6 +174,22 @@ def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
     return run
 
 
+def _ingest(
+    capture: Path | Sequence[Path],
+    asset: Asset,
+    options: IngestOptions,
+    adapter: str | None = None,
+    *,
+    plugins: bool = True,
+    copy_to: Path | None = None,
+) -> TaskResult:
+    with cut_root_aside(asset) as is_made_anew:
+        done = ingest_task(capture, asset, options, adapter, plugins=plugins, copy_to=copy_to)
+    if is_made_anew:
+        _warn_of_cut(asset)
+    return done
+
+
 def _texture(asset: Asset, options: TextureOptions, workers: Workers = HERE) -> TaskResult:
     if not asset.lightings:
         return texture_task(asset, options, workers)
@@ -180,7 +201,7 @@ def _shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> Task
     return in_each_lighting(shade_task, asset, options, workers)
 
 
-ingest = _on_its_folder(ingest_task)
+ingest = _on_its_folder(_ingest)
 texture = _on_its_folder(_texture)
 shade = _on_its_folder(_shade)
 fit = _on_its_folder(fit_task)

@@ -211,8 +211,8 @@ def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, 
 
 
 def _recognised_above(path: Path, sound: list[Adapter]) -> Iterator[Path]:
-    """Folders that it lies in, two at most, that one of our adapters recognises for sure. Nobody
-    named them: what may not be read there is passed over."""
+    """Folders that it lies in, two at most, that one of our adapters recognises for sure, by its
+    ``is_surely`` if it has one. Nobody named them: what may not be read there is passed over."""
     ours = (a for a in sound if a.name in MODULES and a.name not in _OF_ANY_SCENE)
     looks = [getattr(a.module, "is_surely", None) or a.module.matches for a in ours if a.module]
     for folder in path.absolute().parents[:2]:

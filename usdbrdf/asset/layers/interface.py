@@ -9,8 +9,8 @@ compose from the layers of the tasks, the artist's edits included: no fact lies 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +30,7 @@ from usdbrdf.asset.header import (
 from usdbrdf.asset.layers.author import apply_schema, attribute, define, export, over
 from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.atomic import flush_folder, publish, temporary_beside
+from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.files.naming import readable_label
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.capture import Scan
@@ -135,17 +135,30 @@ def is_cut(root: Path) -> bool:
     return _FIRST_LINE.startswith(root.read_bytes().strip(b"\0 \r\n"))
 
 
-def mend_root(asset: Asset, *, by_scan: bool) -> None:
-    """Write the root layer again of which nothing is left, as the scan layer says if it is sound;
-    else remove it, so that ingest writes it with that."""
-    root = asset.root_layer
-    if not by_scan:
-        root.unlink()
-        flush_folder(root.parent)
-        return
+def mend_root(asset: Asset) -> None:
+    """Write the root layer again of which nothing is left, as the scan layer says."""
+    root, scan = asset.root_layer, asset.layer("scan")
     with temporary_beside(root) as staged:
-        write_root(staged, asset, read_header(asset.layer("scan")), capture_up_of(asset))
+        write_root(staged, asset, read_header(scan), capture_up_of(asset))
         publish(staged, root)
+
+
+@contextmanager
+def cut_root_aside(asset: Asset) -> Iterator[bool]:
+    """For ingest no root layer of which nothing is left is there, so that it writes one; where it
+    does not, all stays as it was. Gives whether there is such a layer."""
+    root = asset.root_layer
+    if not is_cut(root):
+        yield False
+        return
+    with environment_failures(str(root)):
+        rest = root.read_bytes()
+        root.unlink()
+    try:
+        yield True
+    finally:
+        if not root.exists():
+            root.write_bytes(rest)
 
 
 def write_contents(path: Path, asset: Asset, header: StageHeader) -> None:
