@@ -95,7 +95,7 @@ def capture_up_of(asset: Asset) -> str:
 
 def refuse_old_layout(asset: Asset) -> None:
     """OwnershipConflict where a version made the asset that had other files and other prims. The
-    root layer is never written over, and edits.usda is about the prims that were there."""
+    root layer is kept, and edits.usda is about the prims that were there."""
     if read_provenance(asset.root_layer).get("version") == "1":
         raise OwnershipConflict(
             f"{asset.root_layer}: the asset was made by an earlier usdbrdf, whose objects were no "

@@ -62,9 +62,9 @@ _OF_FILES = (*_PLACES, "sha256")
 
 def check_root(asset: Asset, header: StageHeader, capture_up: str = "") -> None:
     """Raise if the asset has a root layer that says otherwise about units or the up axis, or was
-    turned from another one than ``capture_up``. USD believes the root, which is never written
-    again: a capture in other units would come out in the wrong size, beneath edits that were made
-    for the old one."""
+    turned from another one than ``capture_up``. USD believes the root, which is kept while
+    anything is left of it: a capture in other units would come out in the wrong size, beneath edits
+    that were made for the old one."""
     if not asset.root_layer.is_file():
         return
     root = read_header(asset.root_layer)
