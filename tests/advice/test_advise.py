@@ -168,8 +168,8 @@ def test_a_folder_that_cannot_be_locked_is_said(advised, tmp_path, capsys):
     shutil.copytree(advised[0], folder := tmp_path / "room")
     (folder / ".usdbrdf/lock").unlink()
     (folder / ".usdbrdf/lock").mkdir()
-    assert main(["advise", str(folder)]) == 4
-    assert "[environment.io]" in capsys.readouterr().err
+    assert main(["advise", str(folder)]) == 6
+    assert "[ownership.place]" in capsys.readouterr().err
 
 
 def test_a_published_version_is_left_alone(advised, tmp_path):

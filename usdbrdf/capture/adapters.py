@@ -211,11 +211,12 @@ def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, 
 
 
 def _recognised_above(path: Path, sound: list[Adapter]) -> Iterator[Path]:
-    """Folders that it lies in, two at most, that one of our adapters recognises for sure, by its
-    ``is_surely`` if it has one. Nobody named them: what may not be read there is passed over."""
+    """The folder that a folder lies in, or the two of a file, if one of our adapters recognises
+    them for sure, by its ``is_surely`` if it has one. Nobody named them: what may not be read there
+    is passed over."""
     ours = (a for a in sound if a.name in MODULES and a.name not in _OF_ANY_SCENE)
     looks = [getattr(a.module, "is_surely", None) or a.module.matches for a in ours if a.module]
-    for folder in path.absolute().parents[:2]:
+    for folder in path.absolute().parents[: 1 if path.is_dir() else 2]:
         for look in looks:
             with suppress(OSError, UsdBrdfError):
                 if look(folder):
