@@ -85,8 +85,6 @@ DESCRIPTIONS = {
 
 
 GROUP = "usdbrdf.adapters"
-# Files of these need not be captures.
-_OF_ANY_SCENE = ("usd", "alembic")
 # Folders in a folder that are asked, where it is no capture itself.
 _MOST_BELOW = 100
 
@@ -212,10 +210,10 @@ def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, 
 
 def _recognised_above(path: Path, sound: list[Adapter]) -> Iterator[Path]:
     """The folder that a folder lies in, or the two of a file, if one of our adapters recognises
-    them for sure, by its ``is_surely`` if it has one. Nobody named them: what may not be read there
-    is passed over."""
-    ours = (a for a in sound if a.name in MODULES and a.name not in _OF_ANY_SCENE)
-    looks = [getattr(a.module, "is_surely", None) or a.module.matches for a in ours if a.module]
+    them for sure, by its ``is_surely``: some match by what lies anywhere below. Nobody named them:
+    what may not be read there is passed over."""
+    ours = (getattr(a.module, "is_surely", None) for a in sound if a.name in MODULES)
+    looks = [look for look in ours if look]
     for folder in path.absolute().parents[: 1 if path.is_dir() else 2]:
         for look in looks:
             with suppress(OSError, UsdBrdfError):

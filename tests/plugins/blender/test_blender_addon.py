@@ -302,6 +302,7 @@ def test_blender_builds_the_extension(source, tmp_path):
         assert {"__init__.py", "blender_manifest.toml"} <= set(archive.namelist())
 
 
+@needs_blender
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_a_sun_is_as_strong_and_as_wide_as_the_asset_says(session, room, tmp_path, scale):
     """One that states its irradiance and one that states its radiance: Blender, too, has both."""
