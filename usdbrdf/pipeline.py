@@ -39,7 +39,7 @@ from usdbrdf.job.progress import say, warn
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.job.task import TaskResult
 from usdbrdf.job.units import HERE, Workers
-from usdbrdf.options import ConvertOptions, HandEdits, IngestOptions, ShadeOptions, TextureOptions
+from usdbrdf.options import ConvertOptions, HandEdits, ShadeOptions, TextureOptions
 from usdbrdf.tasks.fit import fit as fit_task
 from usdbrdf.tasks.fit import refuse_one_frame
 from usdbrdf.tasks.ingest import ingest as ingest_task
@@ -164,8 +164,7 @@ def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
 
     @wraps(task)
     def run(*given: P.args, **named: P.kwargs) -> TaskResult:
-        asset: Asset = signature(task).bind(*given, **named).arguments["asset"]
-        with working_on(asset.folder):
+        with working_on(_asset_of(task, *given, **named).folder):
             result = task(*given, **named)
         if not result.reran:
             say(f"{task.__name__.strip('_')}: up to date")
@@ -174,20 +173,24 @@ def _on_its_folder(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
     return run
 
 
-def _ingest(
-    capture: Path | Sequence[Path],
-    asset: Asset,
-    options: IngestOptions,
-    adapter: str | None = None,
-    *,
-    plugins: bool = True,
-    copy_to: Path | None = None,
-) -> TaskResult:
-    with cut_root_aside(asset) as is_made_anew:
-        done = ingest_task(capture, asset, options, adapter, plugins=plugins, copy_to=copy_to)
-    if is_made_anew:
-        _warn_of_cut(asset)
-    return done
+def _asset_of(task: Callable[P, TaskResult], *given: P.args, **named: P.kwargs) -> Asset:
+    asset: Asset = signature(task).bind(*given, **named).arguments["asset"]
+    return asset
+
+
+def _making_a_cut_root_anew(task: Callable[P, TaskResult]) -> Callable[P, TaskResult]:
+    """A task that writes the root layer where there is none, also where nothing is left of it."""
+
+    @wraps(task)
+    def run(*given: P.args, **named: P.kwargs) -> TaskResult:
+        asset = _asset_of(task, *given, **named)
+        with cut_root_aside(asset) as is_made_anew:
+            done = task(*given, **named)
+        if is_made_anew:
+            _warn_of_cut(asset)
+        return done
+
+    return run
 
 
 def _texture(asset: Asset, options: TextureOptions, workers: Workers = HERE) -> TaskResult:
@@ -201,7 +204,7 @@ def _shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> Task
     return in_each_lighting(shade_task, asset, options, workers)
 
 
-ingest = _on_its_folder(_ingest)
+ingest = _on_its_folder(_making_a_cut_root_anew(ingest_task))
 texture = _on_its_folder(_texture)
 shade = _on_its_folder(_shade)
 fit = _on_its_folder(fit_task)

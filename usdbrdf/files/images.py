@@ -179,7 +179,8 @@ def colour_tag(path: Path) -> tuple[str, tuple[float, ...]]:
     if profile is not None:
         known = space_of_profile(np.asarray(profile, np.uint8).tobytes())
         name = known or name or "an ICC profile without a name"
-    name = name or space_by_chunks(path)
+    if source.format_name() == "png":
+        name = name or space_by_chunks(path)
     if source.format_name() in ("jpeg", "tiff"):
         name = name or space_by_exif(path, spec.getattribute("Exif:ColorSpace"))
     name, places = name or spec.getattribute("oiio:ColorSpace"), spec.getattribute("chromaticities")

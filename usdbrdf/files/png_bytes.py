@@ -9,7 +9,6 @@ from pathlib import Path
 
 from usdbrdf.files.atomic import raise_shortage
 from usdbrdf.files.colour import space_of_primaries
-from usdbrdf.files.tables import beginning_of
 
 _MARK = b"\x89PNG\r\n\x1a\n"
 # Bytes of chunks that are asked for, and chunks before the pixels: in no sound file are there more.
@@ -46,11 +45,10 @@ def _chunks(path: Path) -> dict[bytes, bytes]:
     """The chunks of a PNG before its pixels, by their names, with the data of what is short: text
     and EXIF before them may be long. None of what is no PNG, or cannot be read."""
     found: dict[bytes, bytes] = {}
-    if beginning_of(path, len(_MARK)) != _MARK:
-        return found
     try:
         with path.open("rb") as file:
-            file.seek(len(_MARK))
+            if file.read(len(_MARK)) != _MARK:
+                return found
             for _ in range(_MOST_CHUNKS):
                 head = file.read(8)
                 if len(head) < 8 or head[4:] == b"IDAT":

@@ -305,13 +305,18 @@ def fit_views(
         return found, None
     samples = sampled().samples
     one, other = (sampled().basis(0, own_seed) for own_seed in range(3 * seed, 3 * seed + 2))
-    kind = PAPER if lobe == PAPER else CONDUCTOR
+    kind = _of_metal(lobe)
     conductor = conductor_of(
         samples.radiance, samples.texel, irradiance, (partial(one, kind), partial(other, kind)),
         found, certain=metal,
         of_dielectric=None if kind == lobe else (partial(one, lobe), partial(other, lobe)),
     )  # fmt: skip
     return found, conductor
+
+
+def _of_metal(lobe: int) -> int:
+    """The kind of lobe that metals have in a scene whose other surfaces have this one."""
+    return PAPER if lobe == PAPER else CONDUCTOR
 
 
 def with_doubts_of_light(
@@ -366,7 +371,7 @@ def metal_if_opaque(
     """The ``metal`` that the object ``index`` would be; None where what is behind it shows through
     it, as it does through a pane: then the dielectric that was ``found`` is contradicted by that.
     Before and behind a pane a room may look alike."""
-    held, kind = sampled(), PAPER if lobe == PAPER else CONDUCTOR
+    held, kind = sampled(), _of_metal(lobe)
     of_kind = held.basis(0, 3 * (_SEED_OF_THROUGH + seed))
     strongest = max(metal.f0)
     tint = (np.array(metal.f0, np.float32) / np.float32(strongest))[:, None]

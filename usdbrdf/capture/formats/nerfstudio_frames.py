@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.capture.checks import Findings
-from usdbrdf.capture.conventions import OLD_NERFSTUDIO, are_said_to_be_opencvs
+from usdbrdf.capture.conventions import OLD_NERFSTUDIO, are_said_to_be_opencvs, opengl_from_opencv
 from usdbrdf.capture.formats.colmap import world_from_camera
 from usdbrdf.capture.mesh_frames import Lies, lies_with_points
 from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix, rigid_pose
@@ -117,7 +117,7 @@ def camera_axes(document: Mapping[str, Any]) -> Double:
     Mitsuba's have x to the left and look down +z (nerf_matrix_to_ngp); others may be stated."""
     if _is_mitsubas(document):
         return np.diag([-1.0, 1, -1, 1])
-    return np.diag([1.0, -1, -1, 1]) if are_said_to_be_opencvs(document) else np.eye(4)
+    return opengl_from_opencv(np.eye(4)) if are_said_to_be_opencvs(document) else np.eye(4)
 
 
 def _is_mitsubas(document: Mapping[str, Any]) -> bool:
