@@ -13,7 +13,7 @@ import pytest
 
 from usdbrdf.job.task import TaskRun
 from usdbrdf.job.units import HERE
-from usdbrdf.material import fit_objects, fit_views
+from usdbrdf.material import doubt_of_light, fit_objects, fit_views
 from usdbrdf.material.conductor import conductor_of
 from usdbrdf.material.fit_lobe import FittedKind
 from usdbrdf.material.fit_objects import (
@@ -118,6 +118,26 @@ def test_to_see_everything_twice_tells_of_the_same_metal():
     np.testing.assert_allclose(once.f0, F0, atol=0.1)
 
 
+def test_a_lamp_that_rays_find_and_the_frame_does_not_show_is_no_evidence():
+    """Its ray outweighs all others of the mirror in a sum of squares."""
+    radiance = ((0.01 + F0) * _incident(1)).astype(np.float32)
+    light = np.full((len(TEXEL), 3), 1.5, np.float32)
+    dielectric = LobeEstimate(PHI, 1.0, 0.02, 0.1, 0.0, 1.0, 0.9)
+
+    def basis(seed: int) -> Any:
+        def of_phis(phis: Any) -> tuple[np.ndarray, np.ndarray]:
+            base, slope = _basis(seed)(phis)
+            slope[7] += 500 * F0_OF_PSI
+            return base, slope
+
+        return of_phis
+
+    metal = conductor_of(radiance, TEXEL, light, (basis(2), basis(3)), dielectric)
+    assert metal is not None
+    assert metal.phi == PHI
+    np.testing.assert_allclose(metal.f0, F0, atol=0.03)
+
+
 def test_the_roughest_metal_is_told_by_nobody_but_a_person():
     rough = (0.01 + F0) * _incident(1)
     assert _found(rough, 1.0, phi=0.67) is not None
@@ -155,11 +175,13 @@ def test_a_mirror_is_looked_for_though_a_dielectric_explains_next_to_nothing_of_
 def test_of_a_metal_in_light_that_nobody_knows_f0_is_unknown_and_no_more_than_that(monkeypatch):
     metal = _found((0.01 + F0) * _incident(1), 1.0)
     assert metal is not None
-    monkeypatch.setattr(fit_views, "error_by_doubt", lambda *_: 60.0)
+    monkeypatch.setattr(doubt_of_light, "error_by_doubt", lambda *_: 60.0)
     mirror = LobeEstimate(0.0, 1.0, 0.01, 0.1, 0.0, 1.0, 0.1)
-    found, doubted = fit_views.with_doubts_of_light(DIELECTRIC, lambda: None, 0, mirror, metal)
+    found, doubted = doubt_of_light.with_doubts_of_light(DIELECTRIC, lambda: None, 0, mirror, metal)
     assert doubted.f0_error == found.psi_error == pytest.approx(1 / math.sqrt(12))
-    assert fit_views.with_doubts_of_light(DIELECTRIC, lambda: None, 0, mirror, None)[0] is mirror
+    assert (
+        doubt_of_light.with_doubts_of_light(DIELECTRIC, lambda: None, 0, mirror, None)[0] is mirror
+    )
 
 
 @pytest.mark.parametrize("texture", [0.0, 0.4])

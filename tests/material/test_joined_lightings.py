@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from usdbrdf.material import fit_views
+from usdbrdf.material import doubt_of_light
 from usdbrdf.material.conductor import Conductor
-from usdbrdf.material.fit_views import SampledObject, joined_object, with_doubts_of_light
+from usdbrdf.material.doubt_of_light import with_doubts_of_light
+from usdbrdf.material.fit_views import MIXTURE, SampledObject, joined_object
 from usdbrdf.material.verdict import MAX_PSI_ERROR, NOTHING_KNOWN, SOME_EVIDENCE, LobeEstimate
 from usdbrdf.material.view_model import ViewSamples
 from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC, F0_OF_PSI
@@ -35,7 +36,7 @@ def _seen(texels: int, views: int, cell: float, widths: tuple[float, ...], likel
         cell=cell,
     )
     part: Any = SimpleNamespace(irradiance=None, name=texels)
-    return SampledObject([part], samples, widths, likely, fit_views.MIXTURE)
+    return SampledObject([part], samples, widths, likely, MIXTURE)
 
 
 def test_a_texel_is_another_in_each_lighting():
@@ -78,7 +79,7 @@ def doubted(monkeypatch: pytest.MonkeyPatch) -> Any:
             asked.append(lobe)
             return off
 
-        monkeypatch.setattr(fit_views, "error_by_doubt", error)
+        monkeypatch.setattr(doubt_of_light, "error_by_doubt", error)
         return *with_doubts_of_light(DIELECTRIC, lambda: None, 7, found, metal), asked  # type: ignore[arg-type, return-value]
 
     return of

@@ -15,14 +15,13 @@ from tests.physics.brdf import f_nd
 from tests.physics.surfaces import World, box, room, sphere, world_of
 from tests.scenes import camera_at, look_at
 from usdbrdf.material.conductor import Conductor
+from usdbrdf.material.doubt_of_light import error_by_doubt, with_doubts_of_light
 from usdbrdf.material.fit_target import fit_target_frame
 from usdbrdf.material.fit_views import (
     SampledObject,
-    error_by_doubt,
     fit_views,
     metal_if_opaque,
     sampled_object,
-    with_doubts_of_light,
     with_what_shows_through,
 )
 from usdbrdf.material.observations import Follower, Observations

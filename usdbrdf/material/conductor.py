@@ -28,6 +28,8 @@ _MODEL_ERROR = calibration.number("conductor.model_error")
 _LEAST_ERROR = calibration.number("conductor.least_error")
 # Of a sample, relative: what is further off is no more against a model than this.
 _FURTHEST = calibration.number("conductor.furthest")
+# Reflectances from which the search for one begins.
+_STARTS = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
 class Conductor(NamedTuple):
@@ -78,9 +80,10 @@ def conductor_of(
         return None
     found = [_relative(basis([dielectric.phi]), level) for basis in of_dielectric or bases]
     psi = dielectric.psi * F0_OF_PSI
-    rests = [seen - (base + psi * slope)[..., 0] for base, slope in found]
+    one, other = ((base + psi * slope)[..., 0] for base, slope in found)
     diffuse = irradiance / level
-    albedo = np.clip((rests[0] * diffuse).sum(axis=0) / (diffuse**2).sum(axis=0), 0, 1)
+    albedo = _least_squares(seen, (one, other), (diffuse, diffuse))
+    rests = seen - one, seen - other
     uniform = _size(*(rest - albedo * diffuse for rest in rests))
     # Each texel's own mean takes its share of the errors with it, and was before about as far from
     # the one albedo as that model is off.
@@ -118,15 +121,25 @@ def _relative(lobe: tuple[Float, Float], level: Float) -> tuple[Double, Double]:
 def _least_squares(
     seen: Double, base: tuple[Double, Double], slope: tuple[Double, Double]
 ) -> Double:
-    """F0 (3,) in [0, 1], from products of what has independent noise; samples that are far off are
-    cut back to what they may be."""
-    f0 = np.full(3, 0.5)
-    for _ in range(8):
-        model = (base[0] + base[1] + f0 * (slope[0] + slope[1])) / 2
-        clipped = np.clip(seen, model - _FURTHEST / 2, model + _FURTHEST / 2)
-        crossed = ((clipped - base[0]) * slope[1] + (clipped - base[1]) * slope[0]).sum(axis=0) / 2
-        f0 = np.clip(crossed / np.maximum((slope[0] * slope[1]).sum(axis=0), 1e-12), 0, 1)
-    return np.asarray(f0)
+    """The reflectance (3,) in [0, 1], from products of what has independent noise, with which least
+    is left: samples that are off by as much as counts there tell nothing more, and are left out."""
+    # One ray that finds a lamp which the frame does not show would outweigh all else.
+    shown, product = slope[0] + slope[1], slope[0] * slope[1]
+    of_seen = ((seen - base[0]) * slope[1] + (seen - base[1]) * slope[0]) / 2
+    found = []
+    for start in _STARTS:
+        f0 = np.full(3, start)
+        for _ in range(8):
+            off = seen - (base[0] + base[1] + f0 * shown) / 2
+            used = np.abs(off) < _FURTHEST
+            f0 = np.clip((used * of_seen).sum(axis=0) / _positive(used * product), 0, 1)
+        size = _size(*(seen - b - f0 * s for b, s in zip(base, slope, strict=True)))
+        found.append((size, f0))
+    return np.asarray(min(found, key=lambda one: one[0])[1])
+
+
+def _positive(values: Double) -> Double:
+    return np.asarray(np.maximum(values.sum(axis=0), 1e-12))
 
 
 def _without_means(values: Double, texel: Long, views: Long) -> Double:

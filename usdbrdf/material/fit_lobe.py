@@ -21,7 +21,7 @@ from usdbrdf.material.verdict import (
     least_costs,
     lobe_from_costs,
 )
-from usdbrdf.material.view_model import ViewModel, ViewSamples
+from usdbrdf.material.view_model import UPDATES, ViewModel, ViewSamples
 from usdbrdf.model.arrays import Double, Float, Long
 
 Pair = tuple[Float, Float]
@@ -155,9 +155,9 @@ _LEVEL_1 = (
     1.0,
 )  # fmt: skip
 _LEVEL_2 = 3
-# Steps of expectation maximisation, each after a search of level 1; and how many more with another
-# candidate or another kind of lobe than the first.
-_UPDATES, _MORE = 4, 2
+# Steps of expectation maximisation, each after a search of level 1, with another candidate or
+# another kind of lobe than the first.
+_MORE = 2
 
 
 class Candidate(NamedTuple):
@@ -298,7 +298,7 @@ def fit_lobe(
         return log_of_ratio(coarse, (fit.coarse() for fit in before.fits)) if before else 0.0
 
     with_old = log_ratio(fit.coarse() for fit in fits)
-    for _ in range(_MORE if before else _UPDATES):
+    for _ in range(_MORE if before else UPDATES):
         fits[0].improve()
     coarse = [fit.coarse() for fit in fits]
     with_new = log_ratio(coarse)

@@ -17,6 +17,7 @@ from usdbrdf.files.frames import FramePixels, FrameReader
 from usdbrdf.job.progress import progress
 from usdbrdf.job.task import TaskRun
 from usdbrdf.job.units import Unit
+from usdbrdf.material.doubt_of_light import with_doubts_of_light
 from usdbrdf.material.fit_lobe import first_seed
 from usdbrdf.material.fit_target import (
     FrameCounts,
@@ -34,7 +35,6 @@ from usdbrdf.material.fit_views import (
     joined_object,
     metal_if_opaque,
     sampled_object,
-    with_doubts_of_light,
     with_what_shows_through,
 )
 from usdbrdf.material.observations import Follower, Observations

@@ -30,12 +30,11 @@ from usdbrdf.material.seen_through import radiance_behind, seen_through
 from usdbrdf.material.verdict import (
     MAX_PSI_ERROR,
     MOST_CONTRADICTED,
-    NOTHING_KNOWN,
     SOME_EVIDENCE,
     LobeEstimate,
     verdict_on_views,
 )
-from usdbrdf.material.view_model import LEAST_DIFFUSE, ViewModel, ViewSamples
+from usdbrdf.material.view_model import LEAST_DIFFUSE, ViewSamples
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.footprints import RINGS
@@ -58,8 +57,7 @@ _TIMES_FOR_CURVED = 2
 _CELL_PIXELS = calibration.number("fit.shared_error_size")
 # Of a refractive index of 1.5.
 _USUAL_PSI = USUAL_F0 / F0_OF_PSI
-_UPPER = 1.645  # standard deviations that are exceeded with a probability of 5 %
-_SEED_OF_DOUBT, _SEED_OF_THROUGH = 0xD0B7, 0x71E0
+_SEED_OF_THROUGH = 0x71E0
 
 
 class SampledPart(NamedTuple):
@@ -305,7 +303,7 @@ def fit_views(
         return found, None
     samples = sampled().samples
     one, other = (sampled().basis(0, own_seed) for own_seed in range(3 * seed, 3 * seed + 2))
-    kind = _of_metal(lobe)
+    kind = of_metal(lobe)
     conductor = conductor_of(
         samples.radiance, samples.texel, irradiance, (partial(one, kind), partial(other, kind)),
         found, certain=metal,
@@ -314,37 +312,9 @@ def fit_views(
     return found, conductor
 
 
-def _of_metal(lobe: int) -> int:
+def of_metal(lobe: int) -> int:
     """The kind of lobe that metals have in a scene whose other surfaces have this one."""
     return PAPER if lobe == PAPER else CONDUCTOR
-
-
-def with_doubts_of_light(
-    lobe: int,
-    sampled: Callable[[], SampledObject],
-    seed: int,
-    found: LobeEstimate,
-    metal: Conductor | None,
-) -> tuple[LobeEstimate, Conductor | None]:
-    """The same with the errors that follow from those of light that was inferred, not seen: what a
-    lobe mirrors of a lamp is psi times the lamp's radiance, and only that is measured. All doubts
-    are taken to be off the same way. Where psi of a dielectric is badly known anyway nothing is
-    traced."""
-    untold = found.evidence < SOME_EVIDENCE or found.psi_error > MAX_PSI_ERROR
-    if untold and metal is None:
-        return found, metal
-    kind, phi, psi = lobe, found.phi, found.psi
-    if metal is not None:
-        kind, phi, psi = CONDUCTOR, metal.phi, max(metal.f0) / F0_OF_PSI
-    off = error_by_doubt(sampled(), kind, phi, psi, seed)
-    if metal is not None:
-        error = min(math.hypot(metal.f0_error, F0_OF_PSI * off), float(NOTHING_KNOWN))
-        metal = metal._replace(f0_error=error)
-        off *= found.psi / psi if psi > 0 else 1.0
-    psi_error = min(math.hypot(found.psi_error, off), float(NOTHING_KNOWN))
-    above = math.hypot(found.psi_upper - found.psi, _UPPER * off)
-    upper = min(max(found.psi_upper, found.psi + above), 1.0)
-    return found._replace(psi_error=psi_error, psi_upper=upper), metal
 
 
 def with_what_shows_through(
@@ -371,7 +341,7 @@ def metal_if_opaque(
     """The ``metal`` that the object ``index`` would be; None where what is behind it shows through
     it, as it does through a pane: then the dielectric that was ``found`` is contradicted by that.
     Before and behind a pane a room may look alike."""
-    held, kind = sampled(), _of_metal(lobe)
+    held, kind = sampled(), of_metal(lobe)
     of_kind = held.basis(0, 3 * (_SEED_OF_THROUGH + seed))
     strongest = max(metal.f0)
     tint = (np.array(metal.f0, np.float32) / np.float32(strongest))[:, None]
@@ -385,21 +355,6 @@ def metal_if_opaque(
     if through <= MOST_CONTRADICTED:
         return found, metal
     return found._replace(contradiction=max(found.contradiction, through)), None
-
-
-def error_by_doubt(sampled: SampledObject, kind: int, phi: float, psi: float, seed: int) -> float:
-    """By how much psi would be off if all light were by its standard error: what a lobe would then
-    mirror more, or less, as the samples tell psi; psi itself where they do not."""
-    model = ViewModel(sampled.samples)
-    first = 3 * (_SEED_OF_DOUBT + seed)
-    lobes = [sampled.lobe(kind, phi, first + n)[1] for n in range(2)]
-    base, slope = sampled.lobe(kind, phi, first + 2, of_doubt=True)
-    values = np.concatenate([*lobes, base + np.float32(psi) * slope], axis=2)
-    one, other, doubt = model.reduced(values).parts(3)
-    # Products of independent noises are none on the mean.
-    whole = float(model.product(one, other)[0])
-    part = (float(model.product(one, doubt)[0]) + float(model.product(other, doubt)[0])) / 2
-    return max(part / whole, 0.0) if whole > 0 else psi
 
 
 def _footprints(

@@ -13,13 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from usdbrdf.material.view_model import ViewModel, ViewSamples
+from usdbrdf.material.view_model import UPDATES, ViewModel, ViewSamples
 from usdbrdf.model.arrays import Float
 from usdbrdf.transport.environment import radiance_from
 from usdbrdf.transport.lit_scene import LitScene, SurfacePoints, hits_behind
-
-# Steps of expectation maximisation, of what a lobe and what shows through leave.
-_UPDATES = 4
 
 
 class Through(NamedTuple):
@@ -70,7 +67,7 @@ def seen_through(
     rest = samples.radiance - base
     model = ViewModel(samples)
     through = NOTHING
-    for _ in range(_UPDATES):
+    for _ in range(UPDATES):
         model.update(base + np.float32(psi) * slope + np.float32(through.share) * behind)
         psi, through = _least_squares(model, rest, slope, behind)
         psi = min(psi, most_psi)

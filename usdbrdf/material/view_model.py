@@ -167,6 +167,8 @@ def _symmetric_block(lower: Double, places: Long) -> Double:
 
 _INDEPENDENT = calibration.number("errors.independent")
 _OF_SPECULAR = calibration.number("errors.of_specular")
+# Steps of expectation maximisation from the first guess on.
+UPDATES = 4
 # Where the search for the shared errors' standard deviations starts, and their least value.
 _FIRST_GUESS, _LEAST = 0.02, 1e-4
 # With more shared errors than this, cells are made larger, up to the object.
