@@ -17,7 +17,7 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.options import Sampling
 from usdbrdf.shading import clipped_light, lamp_light
-from usdbrdf.shading.clipped_emitters import UNTOLD, EstimatedRadiance
+from usdbrdf.shading.clipped_emitters import UNTOLD, EstimatedRadiance, nothing_known
 from usdbrdf.shading.clipped_groups import ClippedGroups
 from usdbrdf.shading.clipped_light import ClippedLight, _with_estimates, estimate_clipped_light
 from usdbrdf.shading.shaded import shade_surface
@@ -327,3 +327,24 @@ def test_where_the_sun_falls_on_a_floor_it_is_asked_with_its_bound(tmp_path: Pat
     assert light.groups.object[light.groups.lamp].tolist() == [9]
     assert asked[-1].clipped.any()
     np.testing.assert_allclose(asked[-1].reflected[asked[-1].clipped], np.pi * SATURATION)
+
+
+def test_a_lamp_that_only_the_first_round_tells_stays_as_that_tells_it(
+    beside_table: InTheSun, tmp_path: Path, monkeypatch
+):
+    """With what it shines on as bright as it makes that, no texel may lie evenly enough in its
+    light."""
+    rounds = []
+    by = clipped_light._Weighing._by
+
+    def told(self, light, groups):
+        rounds.append(by(self, light, groups))
+        # Of the first two the one is asked with the table as a lamp, and the other without.
+        return rounds[-1] if len(rounds) < 3 else (nothing_known(len(groups)), rounds[-1][1])
+
+    monkeypatch.setattr(clipped_light._Weighing, "_by", told)
+    light = beside_table.estimated(tmp_path)
+    assert len(rounds) == 3
+    lamp = light.groups.lamp
+    assert light.estimate.determined[lamp].all()
+    np.testing.assert_array_equal(light.estimate.multiplier[lamp], rounds[1][0].multiplier[lamp])

@@ -263,6 +263,15 @@ class EstimatedRadiance:
             determined=self.determined & which,
         )
 
+    def else_of(self, other: EstimatedRadiance) -> EstimatedRadiance:
+        """Of those of the lamps (K,) that are determined in the ``other`` alone what that tells."""
+        which = other.determined & ~self.determined
+        return EstimatedRadiance(
+            multiplier=np.where(which[:, None], other.multiplier, self.multiplier),
+            standard_error=np.where(which[:, None], other.standard_error, self.standard_error),
+            determined=self.determined | which,
+        )
+
 
 def estimate_clipped_emitters(evidence: Evidence) -> EstimatedRadiance:
     """Multipliers g_k of the lamps' lower bounds, with honest errors.

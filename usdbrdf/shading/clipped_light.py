@@ -206,8 +206,10 @@ class _Weighing:
             told = self._beside(self.lit, wall)
         walls = wall | (~groups.lamp & self._is_measured())
         if walls.any() and told.determined[~walls].any() and self._matter(walls):
-            # So may what the lamps themselves shine on.
-            told = self._beside(_with_estimates(self.lit, groups, told.of_lamps(~walls)), walls)
+            # So may what the lamps themselves shine on. Few texels may tell a lamp, and which of
+            # them lie evenly in its light depends on how strong it is taken to be.
+            before = told.of_lamps(~walls)
+            told = self._beside(_with_estimates(self.lit, groups, before), walls).else_of(before)
         return told, wall
 
     def _is_measured(self) -> Bool:
