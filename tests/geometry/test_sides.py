@@ -116,13 +116,43 @@ def test_a_sheet_seen_from_both_sides_gets_a_second_skin():
     assert (gap > -1e-3).all()
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_back_of_a_sheet_that_faces_what_frames_see_is_a_surface_of_its_own(turned: bool):
+    """A lamp's cover before a wall is bright inside, and does not shine on the wall."""
+    points, triangles, face_object, names = room_mesh()
+    sheet = np.float32([[1, 0.4, 1], [3, 0.4, 1], [3, 0.4, 2], [1, 0.4, 2]])
+    number = len(points) + np.int32([[0, 2, 1], [0, 3, 2]])[:, :: -1 if turned else 1]
+    mesh = _mesh(
+        np.concatenate([points, sheet]),
+        np.concatenate([triangles, number]),
+        np.append(face_object, [len(names)] * 2).astype(np.int32),
+    )
+    # They see the wall beside the sheet, but not the sheet's other side.
+    poses = [
+        look_at(np.array([2.0 + 0.1 * k, 2.5, 1.5]), np.array([2.0, 0, 1.5])) for k in range(5)
+    ]
+    sides = _sides(mesh, _cameras(poses))
+    assert (sides.turned[-2:] == turned).all()
+    assert not sides.both.any()
+    # The lamp below the ceiling is another such sheet; floor, walls, ceiling and box are not.
+    lamp = names.index("lamp")
+    assert set(mesh.face_object[sides.faces_room].tolist()) == {lamp, len(names)}
+    assert sides.faces_room[-2:].all()
+    skinned = turned_towards_cameras(mesh, sides, None, 40)
+    assert len(skinned.triangles) == len(mesh.triangles) + sides.skins.sum()
+    normals = face_normals_and_angles(skinned.points, skinned.triangles)[0]
+    np.testing.assert_allclose(normals[-2:], [[0, -1, 0]] * 2, atol=1e-6)
+    assert not sides.of_one_skin().skins.any()
+
+
 def test_normals_turn_with_their_faces_and_missing_ones_are_made(room):
     turned = np.arange(len(room.triangles)) % 2 == 0
     right = corner_normals(room.points, room.triangles, 40)
     wrong = _wound(room, turned)
     flipped = np.where(turned[:, None, None], -right[:, [0, 2, 1]], right)
     nothing = np.zeros(len(turned), np.bool_)
-    sides = Sides(turned=turned, both=nothing, frames=np.zeros((len(turned), 2), np.int32))
+    frames = np.zeros((len(turned), 2), np.int32)
+    sides = Sides(turned=turned, both=nothing, frames=frames, faces_room=nothing)
     given_all = np.ones(len(turned), np.bool_)
     given = turned_towards_cameras(replace(wrong, corner_normals=flipped), sides, given_all, 40)
     np.testing.assert_array_equal(given.triangles, room.triangles)

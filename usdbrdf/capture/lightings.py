@@ -88,7 +88,7 @@ def scan_of_lightings(scans: Mapping[str, Scan], crease_angle_deg: float) -> Sca
     rays = RayScene(mesh.points, mesh.triangles)
     sides = sides_from_cameras(mesh, rays, (frames.camera(i) for i in range(len(frames))))
     if first.usd_geometry is not None:
-        sides = replace(sides, both=np.zeros_like(sides.both))
+        sides = sides.of_one_skin()
     turned = np.zeros(len(triangles), np.bool_)
     turned = turned if first.turned_faces is None else first.turned_faces
     counts = Counter[str]()

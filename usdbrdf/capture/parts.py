@@ -431,7 +431,7 @@ def _sides(
     outside = drop_cameras_inside(frames, geometry.mesh, rays, sides, names, findings)
     if 0 < len(outside) < len(frames):
         sides = seen(frames.at(outside))
-    turned, both = int(sides.turned.sum()), int(sides.both.sum())
+    turned, both = int(sides.turned.sum()), int(sides.skins.sum())
     findings.count("faces_turned", turned)
     findings.count("faces_of_two_sides", both)
     if turned:
@@ -441,7 +441,7 @@ def _sides(
         )
     if both and geometry.usd_geometry is not None:
         # Nothing is added to meshes that are referenced: such a face keeps the side seen more.
-        sides = replace(sides, both=np.zeros_like(sides.both))
+        sides = sides.of_one_skin()
     return sides, outside
 
 

@@ -29,6 +29,8 @@ _PIXELS, _FRAMES_OF_EACH = 2, 2
 _MOST_ACROSS = 1024
 # Faces of an unseen part that look around, and in how many directions from either side.
 _LOOKING, _DIRECTIONS = 16, 16
+# In so many of them nothing is told from something.
+_FIRST_LOOK = 4
 # The second skin lies so far behind the first, as a share of the scene's diagonal: further than
 # rays start above a surface.
 _BEHIND = 4e-5
@@ -59,11 +61,23 @@ class Sides:
     """turned, both (F,) bool: the winding shows the wrong side; frames see either side.
 
     frames  (F, 2) int32: how many of them see the front, which the winding tells, and the back
+    faces_room  (F,) bool: so does the back, of a thin thing, which no frame sees
     """
 
     turned: Bool
     both: Bool
     frames: Int
+    faces_room: Bool
+
+    @property
+    def skins(self) -> Bool:
+        """(F,): the back is a surface of its own, with light of its own."""
+        return self.both | self.faces_room
+
+    def of_one_skin(self) -> Sides:
+        """The same where nothing can be put behind the mesh."""
+        none = np.zeros_like(self.both)
+        return replace(self, both=none, faces_room=none)
 
 
 def sides_from_cameras(mesh: ScanMesh, rays: RayScene, cameras: Iterable[Camera]) -> Sides:
@@ -82,7 +96,12 @@ def sides_from_cameras(mesh: ScanMesh, rays: RayScene, cameras: Iterable[Camera]
         facing = np.where(
             lost, _looking_around(mesh, rays, normals, lost, shown, part, agrees), facing
         )
-    return Sides(turned=facing < 0, both=seen.both, frames=seen.frames)
+    turned = facing < 0
+    alone = np.flatnonzero((seen.pixels >= _PIXELS).any(axis=1) & ~seen.both)
+    faces_room = np.zeros(len(turned), np.bool_)
+    front = np.where(turned, -1.0, 1.0)[:, None] * normals
+    faces_room[alone] = _backs_in_room(mesh, rays, alone, front, seen.both)
+    return Sides(turned=turned, both=seen.both, frames=seen.frames, faces_room=faces_room)
 
 
 def sightings(rays: RayScene, normals: Double, cameras: Iterable[Camera]) -> Sightings:
@@ -213,6 +232,25 @@ def _looking_around(
     return np.where(of_part[part] == 0, 1, np.where(agrees, 1, -1) * of_part[part]).astype(np.int64)
 
 
+def _backs_in_room(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double, both: Bool) -> Bool:
+    """(N,) of ``faces``: most of what lies behind each of them shows its ``front`` (F, 3), or has
+    two. In what is closed, and around a room, it is insides and nothing."""
+    diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
+    corner = mesh.points.astype(np.float64)[mesh.triangles[faces]]
+    score, left = np.zeros(len(faces)), np.arange(len(faces))
+    for number, direction in enumerate(_even_directions(_DIRECTIONS)):
+        # Near each corner in turn, that faces which reach under something are not judged by that.
+        place = (corner[left].sum(axis=1) + corner[left, number % 3]) / 4
+        out = -front[faces[left]]
+        way = direction * np.where((out @ direction)[:, None] < 0, -1.0, 1.0)
+        origin = lift_from_surface(place.astype(np.float32), out.astype(np.float32), diagonal)
+        hit = rays.closest(origin, np.ascontiguousarray(way, np.float32)).face
+        score[left] += (hit >= 0) & (((way * front[hit]).sum(axis=1) < 0) | both[hit])
+        if number == _FIRST_LOOK - 1:
+            left = np.flatnonzero(score > 0)
+    return np.asarray(score > _DIRECTIONS / 2, np.bool_)
+
+
 def _even_directions(count: int) -> Double:
     """(count, 3) unit vectors spread over the sphere, on a spiral."""
     z = (2 * np.arange(count) + 1) / count - 1
@@ -224,7 +262,7 @@ def _even_directions(count: int) -> Double:
 def turned_towards_cameras(
     mesh: ScanMesh, sides: Sides, has_normals: Bool | None, crease_angle_deg: float
 ) -> ScanMesh:
-    """The mesh with its faces turned and, where frames see both sides, a second skin behind.
+    """The mesh with its faces turned and, where the back is a surface of its own, a second skin.
 
     Shading normals that the file gave (has_normals (F,); None: it gave none) turn along, unless
     they were right before; all others are made anew by the crease angle.
@@ -239,11 +277,11 @@ def turned_towards_cameras(
         front = face_normals_and_angles(mesh.points, triangles)[0]
         normals[sides.turned & ((normals.sum(axis=1) * front).sum(axis=1) < 0)] *= -1
         turned = replace(mesh, triangles=triangles, corner_normals=normals)
-    return _with_second_skin(turned, sides.both) if sides.both.any() else turned
+    return _with_second_skin(turned, sides.skins) if sides.skins.any() else turned
 
 
 def _with_second_skin(mesh: ScanMesh, both: Bool) -> ScanMesh:
-    """The faces ``both`` once more, seen from behind and a little behind themselves."""
+    """The faces ``both`` (F,) once more, seen from behind and a little behind themselves."""
     corner = mesh.points[mesh.triangles[both]]
     normal = face_normals_and_angles(mesh.points, mesh.triangles[both])[0]
     diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
