@@ -40,6 +40,7 @@ from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.colour import kind_of_encoding, known_encodings
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import MAX_SIDE, image_size
+from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens, whole_sphere
@@ -64,7 +65,8 @@ beside_mesh = statements_beside
 def matches(path: Path) -> bool:
     """A folder with transforms.json, or such a document itself."""
     document = _document(path)
-    return document.suffix == ".json" and document.is_file()
+    is_json = document.suffix == ".json" and document.is_file()
+    return is_json and b'"PinholeCamera' not in beginning_of(document)  # Open3D's
 
 
 def is_surely(path: Path) -> bool:
