@@ -29,6 +29,7 @@ from usdbrdf.capture.formats.nerfstudio_frames import (
     stated_pose,
     statements_beside,
     warn_of_bad,
+    warn_of_moved_by_wai,
 )
 from usdbrdf.capture.mesh_frames import mesh_beside, scene_above
 from usdbrdf.capture.nerfstudio_lens import focal_of_angle, lens_of_frame, with_skew
@@ -122,6 +123,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 def _geometry(capture: _Capture, findings: Findings) -> ScanGeometry:
     """Of the mesh that the document names, else mesh.ply beside it, else the only one there."""
     options, root = capture.options, capture.source.parent
+    warn_of_moved_by_wai(capture.document, capture.source, findings)
     mesh = options.mesh or _beside(capture, "mesh", "mesh.ply")
     if options.mesh is None and capture.document.get("mesh") in capture.pictured.moved:
         findings.warn(
