@@ -149,6 +149,31 @@ def test_frames_are_found_by_other_spellings_of_their_names(made, name, files, t
     assert any("[capture.file]" in sentence for sentence in scan.warnings) == told
 
 
+# The beginning of a HEIC as telephones write it: a box of its brand, and of others.
+HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(64)
+
+
+@pytest.mark.parametrize("name", ["{:04d}.heic", "{:04d}.JPG"])
+def test_pictures_of_telephones_that_are_not_read_say_how_to_convert_them(made, name):
+    """As they are, and as people rename them."""
+    _rename(made, f"photographs/{name}")
+    (made.folder / "photographs").mkdir()
+    for i in range(12):
+        (made.folder / "photographs" / name.format(i)).write_bytes(HEIC)
+    with pytest.raises(
+        InputRefused, match=r"HEIC or AVIF.*heif-convert -q 97.*\[capture\.image\]$"
+    ):
+        _read(made, assume_srgb=True)
+
+
+def test_a_folder_of_such_alone_says_so_too(tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images/IMG_1.HEIC").write_bytes(HEIC)
+    pictures = pictures_of(tmp_path, IngestOptions())
+    with pytest.raises(InputRefused, match=r"IMG_1\.HEIC is HEIC or AVIF.*\[capture\.frames\]$"):
+        named_pictures.refuse_without_pictures(pictures, tmp_path / "cameras.xml")
+
+
 def test_a_jpeg_is_a_jpg_also_beside_others(made):
     _as_photographs(made, ".jpg")
     (made.folder / "photographs/0003.jpg").rename(made.folder / "photographs/0003.JPEG")
