@@ -531,6 +531,27 @@ def test_a_folder_of_masks_that_are_nobodys_is_told(made):
     assert "nothing is masked" in said[0]
 
 
+@pytest.mark.parametrize("name", ["mask", "Masks"])
+def test_a_folder_of_masks_by_another_name_is_told(made, name):
+    for i in range(12):
+        _write_bytes(made.folder / name / f"{i:04d}.png", np.zeros((24, 32, 1), np.uint8))
+    said = [sentence for sentence in _read(made).warnings if "[capture.mask]" in sentence]
+    assert len(said) == 1
+    assert f"there is a folder {name}, but it is not called masks" in said[0]
+
+
+@pytest.mark.parametrize("name", ["label", "face_segment"])
+def test_labels_of_faces_by_another_name_are_told(made, name):
+    write_ply(made.folder / "mesh.ply", made.points, made.triangles, made.face_object)
+    content = (
+        (made.folder / "mesh.ply").read_bytes().replace(b" object_id\n", f" {name}\n".encode())
+    )
+    (made.folder / "mesh.ply").write_bytes(content)
+    (made.folder / "objects.json").unlink(missing_ok=True)
+    (said,) = (sentence for sentence in _read(made).warnings if "[objects.none]" in sentence)
+    assert f"no object labels (its faces have {name!r}: call it object_id" in said
+
+
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 def test_a_mask_is_its_colours_and_not_its_alpha(tmp_path, channels):
     pixels = np.zeros((4, 6, channels), np.uint8)

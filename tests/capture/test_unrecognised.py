@@ -211,6 +211,15 @@ def test_the_folder_above_a_capture_names_the_one_to_ask_for(tmp_path):
     assert said.startswith(": no capture itself, but export/scene/ in it is one (transforms). Name")
 
 
+@pytest.mark.parametrize("name", ["Transforms.json", "transforms (1).json", "transforms.json.txt"])
+def test_a_document_by_another_name_says_what_it_is_to_be_called(tmp_path, name):
+    made = make_capture(tmp_path / "room", subdivisions=1)
+    made.manifest.rename(made.folder / name)
+    said = rf"{re.escape(name)} has poses as a transforms\.json has\. Call it transforms\.json"
+    with pytest.raises(InputRefused, match=said):
+        choose_adapter(made.folder)
+
+
 @pytest.mark.parametrize("part", ["frames", "frames/0003.exr", "mesh.ply"])
 def test_a_part_of_a_capture_names_the_folder_to_ask_for(tmp_path, monkeypatch, part):
     """It was to have its cameras found, which are there."""

@@ -299,6 +299,8 @@ def what_lies_there(path: Path, *, above: Path | None = None) -> str:
     if parts:
         largest = max(parts, key=lambda file: file.stat().st_size)
         return f"{largest.name} holds the cameras of some of its pictures. Name that file"
+    if (said := _by_another_name(files)) != "":
+        return said
     for file in files:
         if file.suffix.lower() not in _NO_DOCUMENTS and (said := other_program(file)):
             return said
@@ -343,6 +345,19 @@ def what_lies_there(path: Path, *, above: Path | None = None) -> str:
         else "Have them found (COLMAP, Metashape, RealityScan), and name the folder that holds both"
     )
     return f"it holds {held}, but nothing known here says where the cameras stood. {how}"
+
+
+def _by_another_name(files: Sequence[Path]) -> str:
+    """Which of these is a transforms.json that is called otherwise, as Transforms.json, or with a
+    (1) or .txt behind it, and what to do; "" where none is."""
+    from usdbrdf.files.tables import beginning_of
+
+    for file in files:
+        if file.suffix.lower() in (".json", ".txt"):
+            head = beginning_of(file, _HEAD)
+            if b'"frames"' in head and b'"transform_matrix"' in head and b'"file_path"' in head:
+                return f"{file.name} has poses as a transforms.json has. Call it transforms.json"
+    return ""
 
 
 def _not_yet(files: Sequence[Path]) -> str:

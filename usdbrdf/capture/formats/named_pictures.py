@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
 from usdbrdf.capture.develop import with_rims
-from usdbrdf.capture.mesh_frames import path_in_capture
+from usdbrdf.capture.mesh_frames import folder_of_masks, path_in_capture
 from usdbrdf.capture.parts import (
     LabelTable,
     as_photographs,
@@ -424,10 +424,11 @@ def scan_of(
             f"{source.name}: {masks} masks are used; what is black there is not looked at. "
             "[capture.mask]"
         )
-    elif (folder / "masks").is_dir() and any(seen_of((folder / "masks").iterdir())):
+    elif unused := folder_of_masks(folder):
+        called = "none of its pictures" if unused == "masks" else "it is not called masks, or none"
         findings.warn(
-            f"{source.name}: nothing is masked: there is a folder masks, but none of its pictures "
-            "is called as one of the frames, or named by it. [capture.mask]"
+            f"{source.name}: nothing is masked: there is a folder {unused}, but {called} is called "
+            "as one of the frames, or named by it. [capture.mask]"
         )
     encoding = options.encoding or encoding
     photographs = refuse_photographs(
