@@ -71,7 +71,7 @@ def _write_record3d(folder, room, *, place="rgbd", per_frame=True, extra=(), **s
     if per_frame:
         document["perFrameIntrinsicCoeffs"] = [*room.intrinsics.tolist(), *([[1] * 4] * len(extra))]
     name = "metadata" if place == "rgbd" else "metadata.json"
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / name).write_text(json.dumps(document | stated))
     _pictures(folder, room, place + "/{}.jpg")
     (folder / place / "0.depth").write_bytes(b"bvx2")
@@ -135,7 +135,7 @@ def _write_stray(folder, room, *, start=0, numbers=None, old=False, name="rgb/{:
         if not old:
             words += [f"{number:.9g}" for number in room.intrinsics[i]] + ["", ""]
         lines.append(", ".join(words))
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     (folder / "odometry.csv").write_text("\n".join(lines) + "\n")
     fx, fy, cx, cy = room.intrinsics[-1]
     (folder / "camera_matrix.csv").write_text(f"{fx}, 0.0, {cx}\n0.0, {fy}, {cy}\n0.0, 0.0, 1.0")
