@@ -344,6 +344,7 @@ ENGINEERING: dict[str, str] = {
     "_NGP_SCALE": "convention of a format",
     "_NOISY": "from here on a warning is printed",
     "_NO_SKEW": "limit of what is refused",
+    "_LOST": "limit of what is refused",
     "_OFF_CENTRE": "limit of what is refused",
     "_OFF_SPHERE": "limit of what is refused",
     "_OF_FRAMES": "memory",

@@ -138,6 +138,7 @@ _STRAY = [
     ("a_parameters.txt", "fileName imageWidth imageHeight", "pix4d"),
     ("bundle.out", "# Bundle file v0.3", "bundler"),
     ("a.nvm", "NVM_V3", "visualsfm"),
+    ("a.json", '{"class_name": "PinholeCameraTrajectory"}', "rgbd-scan"),
 ]
 
 

@@ -149,6 +149,31 @@ def test_frames_are_found_by_other_spellings_of_their_names(made, name, files, t
     assert any("[capture.file]" in sentence for sentence in scan.warnings) == told
 
 
+# The beginning of a HEIC as telephones write it: a box of its brand, and of others.
+HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(64)
+
+
+@pytest.mark.parametrize("name", ["{:04d}.heic", "{:04d}.JPG"])
+def test_pictures_of_telephones_that_are_not_read_say_how_to_convert_them(made, name):
+    """As they are, and as people rename them."""
+    _rename(made, f"photographs/{name}")
+    (made.folder / "photographs").mkdir()
+    for i in range(12):
+        (made.folder / "photographs" / name.format(i)).write_bytes(HEIC)
+    with pytest.raises(
+        InputRefused, match=r"HEIC or AVIF.*heif-convert -q 97.*\[capture\.image\]$"
+    ):
+        _read(made, assume_srgb=True)
+
+
+def test_a_folder_of_such_alone_says_so_too(tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images/IMG_1.HEIC").write_bytes(HEIC)
+    pictures = pictures_of(tmp_path, IngestOptions())
+    with pytest.raises(InputRefused, match=r"IMG_1\.HEIC is HEIC or AVIF.*\[capture\.frames\]$"):
+        named_pictures.refuse_without_pictures(pictures, tmp_path / "cameras.xml")
+
+
 def test_a_jpeg_is_a_jpg_also_beside_others(made):
     _as_photographs(made, ".jpg")
     (made.folder / "photographs/0003.jpg").rename(made.folder / "photographs/0003.JPEG")
@@ -504,6 +529,27 @@ def test_a_folder_of_masks_that_are_nobodys_is_told(made):
     said = [sentence for sentence in _read(made).warnings if "[capture.mask]" in sentence]
     assert len(said) == 1
     assert "nothing is masked" in said[0]
+
+
+@pytest.mark.parametrize("name", ["mask", "Masks"])
+def test_a_folder_of_masks_by_another_name_is_told(made, name):
+    for i in range(12):
+        _write_bytes(made.folder / name / f"{i:04d}.png", np.zeros((24, 32, 1), np.uint8))
+    said = [sentence for sentence in _read(made).warnings if "[capture.mask]" in sentence]
+    assert len(said) == 1
+    assert f"there is a folder {name}, but it is not called masks" in said[0]
+
+
+@pytest.mark.parametrize("name", ["label", "face_segment"])
+def test_labels_of_faces_by_another_name_are_told(made, name):
+    write_ply(made.folder / "mesh.ply", made.points, made.triangles, made.face_object)
+    content = (
+        (made.folder / "mesh.ply").read_bytes().replace(b" object_id\n", f" {name}\n".encode())
+    )
+    (made.folder / "mesh.ply").write_bytes(content)
+    (made.folder / "objects.json").unlink(missing_ok=True)
+    (said,) = (sentence for sentence in _read(made).warnings if "[objects.none]" in sentence)
+    assert f"no object labels (its faces have {name!r}: call it object_id" in said
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])

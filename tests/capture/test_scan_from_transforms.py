@@ -163,6 +163,43 @@ def test_a_mesh_that_is_no_name_does_not_matter_where_the_user_names_one(capture
         read_scan(capture.folder, IngestOptions())
 
 
+@pytest.mark.parametrize("rows", [3, 4])
+def test_matrices_may_be_lists_of_their_numbers(capture, rows):
+    """Row by row; such that have columns first are no poses."""
+    applied = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 0.25], [0, 0, 0, 1]])
+    with edited(capture.manifest) as document:
+        document["applied_transform"] = applied[:rows].ravel().tolist()
+        for frame in document["frames"]:
+            pose = applied @ np.array(frame["transform_matrix"])
+            frame["transform_matrix"] = pose[:rows].ravel().tolist()
+    scan = read_scan(capture.folder, IngestOptions())
+    np.testing.assert_allclose(scan.frames.world_from_camera, capture.world_from_camera, atol=1e-9)
+    with edited(capture.manifest) as document:
+        for frame in document["frames"]:
+            pose = np.reshape(frame["transform_matrix"], (rows, 4))
+            frame["transform_matrix"] = pose.T.ravel().tolist()
+    with pytest.raises(InputRefused, match=r"not a finite 4 x 4 camera matrix|sheared or scaled"):
+        read_scan(capture.folder, IngestOptions())
+
+
+@pytest.mark.parametrize(
+    ("matrix", "told"),
+    [
+        (np.eye(4).tolist(), False),
+        (np.eye(3).tolist(), False),
+        (np.diag([1.0, -1, -1, 1]).tolist(), False),
+        ([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]], True),
+        (np.diag([2.0, 2, 2, 1]).tolist(), True),
+        ("unknown", True),
+    ],
+)
+def test_what_mapanything_did_to_poses_is_told(capture, matrix, told):
+    with edited(capture.manifest) as document:
+        document["_applied_transform"] = matrix
+    scan = read_scan(capture.folder, IngestOptions())
+    assert any("says that its poses were moved" in said for said in scan.warnings) == told
+
+
 @pytest.mark.parametrize("text", ['{"scene": "room"}', '{"frames": 3}', "[]", "{"])
 def test_a_scene_meta_of_another_program_is_no_capture(tmp_path, text):
     """It took captures from the adapters that are asked later."""

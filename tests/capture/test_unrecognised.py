@@ -19,19 +19,16 @@ DOCUMENTS = [
     ("castle.mg", '{"header": {}}', "Meshroom", "cameras.sfm"),
     ("sfm_data.bin", "\x00", "OpenMVG", "ConvertSfM_DataFormat"),
     ("mine.json", '[{"cameras": {}, "shots": {}}]', "OpenSfM", "reconstruction.json"),
-    ("trajectory.json", '{"class_name": "PinholeCameraTrajectory"}', "Open3D", "example"),
-    ("run.log", "0\t0\t1\n1 0 0 0\n0 1e-3 0 0\n0 -0 1 0\n0 0 0 1\n", "Open3D", "trajectory.json"),
     ("1234.json", '{"t_00": 1, "fx": 700, "blur_score": 5}', "Polycam", "holds keyframes/"),
-    ("metadata.json", '{"K": [], "poses": []}', "Record3D", "ns-process-data record3d"),
-    ("room.r3d", "PK\x03\x04", "Record3D", "fuse the depths into a mesh"),
-    ("metadata", '{"K": [], "poses": []}', "Record3D", "ns-process-data record3d"),
+    ("metadata.json", '{"K": [], "poses": []}', "Record3D", "in which rgb/ lies beside it"),
+    ("room.r3d", "PK\x03\x04", "Record3D", "which is a ZIP file"),
+    ("metadata", '{"K": [], "poses": []}', "Record3D", "the folder that has metadata and rgbd/"),
     ("scene0000_00.sens", "\x04", "ScanNet", "reader.py (--export_color_images --export_poses"),
     ("groundtruth.txt", "# ground truth trajectory\n", "TUM RGB-D", "a transforms.json"),
     ("run.txt", "#\n# timestamp tx ty tz qx qy qz qw\n", "TUM RGB-D", "fuse the depths"),
     ("frame-000000.pose.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "7-Scenes", "fuse the"),
     ("color.traj", "1.5 0.1 0.2 0.3 0 0 0\n", "ARKitScenes", "the video's folder"),
     ("41254.1_2.pincam", "256 192 211 211 128 96\n", "ARKitScenes", "the video's folder"),
-    ("house.conf", "dataset matterport\nn_images 90\n", "Matterport3D", "the scene's mesh"),
     ("cameras.json", '[{"id": 0, "img_name": "1"}]', "Gaussian splatting", "trained on"),
     ("meta_data.json", '{"frames": [{"camtoworld": []}]}', "SDFStudio", "COLMAP"),
     ("cameras_sphere.npz", "PK\x03\x04", "NeuS", "COLMAP"),
@@ -76,7 +73,7 @@ DOCUMENTS = [
     ("CameraTrajectory.txt", "1.5 0 0 0 0 0 0 1\n", "ORB-SLAM", "fuse the"),
     ("poses.txt", "1e0 0 0 0 0 1 0 0 0 0 1 0\n", "KITTI", "a transforms.json"),
     ("data.csv", "#timestamp, p_RS_R_x [m]", "EuRoC", "a transforms.json"),
-    ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n", "Stray Scanner", "fuse the"),
+    ("run.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n", "Stray Scanner", "odometry.csv"),
     ("pano-poses.csv", "# pano poses v1.0: ID; filename", "NavVis", "EQUIRECTANGULAR"),
     ("00000000_cam.txt", "extrinsic\n1 0 0 0\n", "MVSNet", "a transforms.json"),
     ("metadata_cameras.csv", "camera_name\ncam_00\n", "Hypersim", "a transforms.json"),
@@ -212,6 +209,15 @@ def test_the_folder_above_a_capture_names_the_one_to_ask_for(tmp_path):
     (tmp_path / "export/scene/transforms.json").write_text("{}")
     said = _refused(tmp_path)
     assert said.startswith(": no capture itself, but export/scene/ in it is one (transforms). Name")
+
+
+@pytest.mark.parametrize("name", ["Transforms.json", "transforms (1).json", "transforms.json.txt"])
+def test_a_document_by_another_name_says_what_it_is_to_be_called(tmp_path, name):
+    made = make_capture(tmp_path / "room", subdivisions=1)
+    made.manifest.rename(made.folder / name)
+    said = rf"{re.escape(name)} has poses as a transforms\.json has\. Call it transforms\.json"
+    with pytest.raises(InputRefused, match=said):
+        choose_adapter(made.folder)
 
 
 @pytest.mark.parametrize("part", ["frames", "frames/0003.exr", "mesh.ply"])

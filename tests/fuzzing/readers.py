@@ -322,6 +322,14 @@ READERS = {
             )
             for name in ("arkitscenes", "blocks-exchange", "bundler", "opf", "pix4d", "visualsfm")
         ),
+        _of_capture(
+            "rgbd-scan",
+            photographs=True,
+            lines=(
+                "usdbrdf.capture.reconstructions.rgbd_scans",
+                "usdbrdf.capture.reconstructions.trajectories",
+            ),
+        ),
         _of_capture("e57", photographs=True),
         _of_capture(
             "usd",

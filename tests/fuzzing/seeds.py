@@ -33,6 +33,7 @@ from tests.capture import (
     test_scan_from_pix4d,
     test_scan_from_realityscan,
     test_scan_from_replica,
+    test_scan_from_rgbd_scans,
     test_scan_from_scanner_app,
     test_scan_from_scannet,
     test_scan_from_scannetpp,
@@ -473,6 +474,22 @@ def opf(folder: Path) -> list[Seed]:
     room = _room().square()
     test_scan_from_opf._write(folder, room, test_scan_from_opf._documents(room))
     return _capture(folder, "room.opf", "parts/*.json")
+
+
+def rgbd_scan(folder: Path) -> list[Seed]:
+    """One of each program, with its documents."""
+    written = test_scan_from_rgbd_scans
+    room, seeds = _room(), []
+    documents = {
+        "record3d": ("metadata",),
+        "stray": ("odometry.csv", "camera_matrix.csv"),
+        "matterport": ("matterport_camera_poses/*", "matterport_camera_intrinsics/*"),
+        "log": ("trajectory.log", "intrinsic.json"),
+    }
+    for name in documents:
+        getattr(written, f"_write_{name}")(folder / name, room)
+        seeds += _capture(folder / name, *documents[name])
+    return seeds
 
 
 def visualsfm(folder: Path) -> list[Seed]:

@@ -52,6 +52,7 @@ MODULES = {
     "opf": "usdbrdf.capture.reconstructions.opf",
     "bundler": "usdbrdf.capture.reconstructions.bundler",
     "visualsfm": "usdbrdf.capture.reconstructions.visualsfm",
+    "rgbd-scan": "usdbrdf.capture.reconstructions.rgbd_scans",
     "usd": "usdbrdf.capture.formats.usd_stage",
     "alembic": "usdbrdf.capture.formats.alembic",
 }
@@ -79,6 +80,7 @@ DESCRIPTIONS = {
     "opf": "project of PIX4Dmatic in the Open Photogrammetry Format (.opf), pictures, and a mesh",
     "bundler": "cameras as Bundler writes them (bundle.out, list.txt), pictures, and a mesh",
     "visualsfm": "reconstruction of VisualSFM (.nvm), pictures, and a mesh",
+    "rgbd-scan": "scan of Record3D, Stray Scanner, Open3D or Matterport3D, and a mesh",
     "usd": "USD stage whose cameras are the photographs (back plates, or pictures by name)",
     "alembic": "Alembic cameras: not read, says how to convert them",
 }

@@ -95,7 +95,7 @@ _CURES = {
     "entries.",
     "capture.label": "Give each a label of its own, or put them into camera groups that are called "
     "as the folders of their pictures, and export the cameras again.",
-    "capture.image": "Export the images again as R, G, B float EXR.",
+    "capture.image": "Export the images again, as R, G, B float EXR where they are radiance.",
     "capture.alpha": "Leave them out, or export them with what they show opaque.",
     "capture.mask": "Export a mask of the photograph's size for it, or remove its entry.",
     "capture.size": "Use the images that the intrinsics are for, or state the w and h of these.",

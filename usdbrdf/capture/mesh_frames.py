@@ -18,9 +18,9 @@ from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import colmap_points
+from usdbrdf.untrusted.mesh_files import LABEL_PROPERTY, mesh_from_file
 from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
-from usdbrdf.untrusted.mesh_files import mesh_from_file
-from usdbrdf.untrusted.mesh_ply import LONGEST_HEADER, holds_points_alone
+from usdbrdf.untrusted.mesh_ply import LONGEST_HEADER, holds_points_alone, whole_number_of_faces
 from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 # Places on the mesh, faces that are looked at at a time, or whose corners are compared, and points
@@ -71,6 +71,22 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
     elif there and not others:
         said += f" ({there[0].name} holds points alone)"
     raise MeshMissing(f"{folder}: {said}. {how}, or name one with --mesh. [mesh.missing]")
+
+
+def folder_of_masks(folder: Path) -> str:
+    """The folder masks, else one that is called nearly so, if it holds anything; "" without one."""
+    alike = [p for p in seen_of(folder.iterdir()) if p.name.lower().strip("_") in ("mask", "masks")]
+    alike.sort(key=lambda place: place.name != "masks")
+    return next((p.name for p in alike if p.is_dir() and any(seen_of(p.iterdir()))), "")
+
+
+def labels_of_others(mesh: Path) -> str:
+    """A clause on a number of each face of a PLY that may be its object's, and is not taken for
+    that as it is called otherwise; "" without one."""
+    name = whole_number_of_faces(beginning_of(mesh, LONGEST_HEADER))
+    return (
+        f" (its faces have {name!r}: call it {LABEL_PROPERTY} if it tells objects)" if name else ""
+    )
 
 
 def scene_above(document: Path) -> Path | None:

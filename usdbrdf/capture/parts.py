@@ -28,6 +28,7 @@ from usdbrdf.capture.checks import (
     with_masks,
 )
 from usdbrdf.capture.develop import frames_of_photographs
+from usdbrdf.capture.mesh_frames import labels_of_others
 from usdbrdf.capture.rigid_poses import rigid_records
 from usdbrdf.errors import InputRefused, MeshMissing, UsageError, UsdBrdfError
 from usdbrdf.files.colour import kind_of_encoding, known_encodings, unknown_encoding
@@ -279,8 +280,8 @@ def geometry_from_file(
     unlabelled = mesh.face_label is None and (table is None or table.face_id is None)
     if unlabelled:
         findings.warn(
-            f"{mesh_path.name}: no object labels; {len(split.labels)} objects have been made from "
-            "connected parts. [objects.none]"
+            f"{mesh_path.name}: no object labels{labels_of_others(mesh_path)}; {len(split.labels)} "
+            "objects have been made from connected parts. [objects.none]"
         )
     clean = clean_mesh(
         mesh.points,

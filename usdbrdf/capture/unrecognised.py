@@ -77,6 +77,11 @@ _NOTHING = rb"(?!)"
 # that turn and move, without which they may be any numbers.
 _TABLE = rb"\A(?:[ \t]*(?:[-+.\deE]+[ \t,]+){%b}[-+.\deE]+[ \t]*\r?\n){3}"
 _OF_A_POSE = rb"[ \t]*(?:-?0(?:\.0*)?(?:[eE][-+]?\d+)?[ \t,]+){3}1(?:\.0*)?(?:[eE][-+]?0+)?\s*\Z"
+# Of Open3D's logs: three whole numbers, and a matrix of four rows. And of what others' tables and
+# lists begin with that are read, the former by one name alone.
+OPEN3D_LOG = rb"\A\d+\s+\d+\s+\d+[ \t\r]*\n(?:[ \t]*(?:[-+.\de]+\s+){4}){4}"
+STRAY_TABLE = rb"\A(?:\xef\xbb\xbf)?timestamp, *frame, *x, *y, *z, *qx"
+OF_MATTERPORT = rb"(?m)^dataset matterport"
 _PROGRAMS = (
     _Program(
         "OpenMVG", ("sfm_data.bin", "sfm_data.xml"), (), _NOTHING,
@@ -89,12 +94,6 @@ _PROGRAMS = (
     _Program(
         "OpenSfM", (), (), rb'"shots"', "Call the file reconstruction.json, and name its folder",
     ),
-    _Program("Open3D", (), (), rb'"PinholeCameraTrajectory"', f"Read them with {_EXAMPLE}"),
-    # Three whole numbers, and a matrix of four rows.
-    _Program(
-        "Open3D", (), (), rb"\A\d+\s+\d+\s+\d+[ \t\r]*\n(?:[ \t]*(?:[-+.\de]+\s+){4}){4}",
-        f"Write them as trajectory.json, with the lens, and read them with {_EXAMPLE}",
-    ),
     _Program("VisualSFM", (".nvm",), (), rb"NVM_V", _ANEW),
     _Program(
         "Polycam", (), (), rb'"t_00"',
@@ -102,15 +101,13 @@ _PROGRAMS = (
     ),
     _Program(
         "Record3D", (), (), rb'"poses"',
-        "Make a transforms.json of them with nerfstudio's 'ns-process-data record3d', and a mesh "
-        "of the depths in its frame",
+        "Name the folder of its export, in which rgb/ lies beside it",
         "metadata.json",
     ),
     # "metadata" of one that has been unpacked.
     _Program(
         "Record3D", (".r3d",), (), rb'"poses"',
-        "Export EXR and JPG for nerfstudio's 'ns-process-data record3d', and fuse the depths into "
-        "a mesh",
+        "Unzip the .r3d, which is a ZIP file, and name the folder that has metadata and rgbd/",
         "metadata",
     ),
     _Program(
@@ -129,10 +126,6 @@ _PROGRAMS = (
     _Program(
         "ARKitScenes", (".traj", ".pincam"), (), _NOTHING,
         "Name the video's folder, which has lowres_wide.traj, lowres_wide/ and its _intrinsics/",
-    ),
-    _Program(
-        "Matterport3D", (), (), rb"(?m)^dataset matterport",
-        f"{_BY_HAND}, and name the scene's mesh in it",
     ),
     _Program(
         "Gaussian splatting", (), (), rb'"img_name"',
@@ -228,8 +221,7 @@ _PROGRAMS = (
     ),
     _Program("EuRoC", (), (), rb"\A#timestamp.*p_RS_R_x", f"{_BY_HAND}, and fuse a mesh (Open3D)"),
     _Program(
-        "Stray Scanner", (), (), rb"\Atimestamp, *frame, *x, *y, *z, *qx",
-        f"{_BY_HAND}, and fuse the depths into a mesh (Open3D)",
+        "Stray Scanner", (), (), STRAY_TABLE, "Call it odometry.csv, and name its folder",
     ),
     _Program(
         "NavVis", (), (), rb"\A# *pano poses",
@@ -307,6 +299,8 @@ def what_lies_there(path: Path, *, above: Path | None = None) -> str:
     if parts:
         largest = max(parts, key=lambda file: file.stat().st_size)
         return f"{largest.name} holds the cameras of some of its pictures. Name that file"
+    if (said := _by_another_name(files)) != "":
+        return said
     for file in files:
         if file.suffix.lower() not in _NO_DOCUMENTS and (said := other_program(file)):
             return said
@@ -351,6 +345,19 @@ def what_lies_there(path: Path, *, above: Path | None = None) -> str:
         else "Have them found (COLMAP, Metashape, RealityScan), and name the folder that holds both"
     )
     return f"it holds {held}, but nothing known here says where the cameras stood. {how}"
+
+
+def _by_another_name(files: Sequence[Path]) -> str:
+    """Which of these is a transforms.json that is called otherwise, as Transforms.json, or with a
+    (1) or .txt behind it, and what to do; "" where none is."""
+    from usdbrdf.files.tables import beginning_of
+
+    for file in files:
+        if file.suffix.lower() in (".json", ".txt"):
+            head = beginning_of(file, _HEAD)
+            if b'"frames"' in head and b'"transform_matrix"' in head and b'"file_path"' in head:
+                return f"{file.name} has poses as a transforms.json has. Call it transforms.json"
+    return ""
 
 
 def _not_yet(files: Sequence[Path]) -> str:

@@ -119,7 +119,28 @@ def readable_size(image: Path) -> int | str:
         return "not a regular file. Name an image file"
     if not os.access(image, os.R_OK):
         return "permission denied. Make it readable"
-    return why_not_fetched(image) or status.st_size
+    return why_not_fetched(image) or (AS_JPEG if is_heif(image) else status.st_size)
+
+
+# Of what telephones write, and what to do; these programs turn the pixels upright and keep the
+# colour profile.
+AS_JPEG = (
+    "HEIC or AVIF, which is not read here. Make JPEGs of all, of the same names, beside them: "
+    "'heif-convert -q 97 IMG.HEIC IMG.jpg' of libheif, or 'sips -s format jpeg' of macOS"
+)
+
+
+def is_heif(file: Path) -> bool:
+    """Whether a file is in the container of HEIC and AVIF, whatever it is called."""
+    with suppress(OSError), file.open("rb") as opened:
+        head = opened.read(12)
+        return head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS
+    return False
+
+
+_HEIF_BRANDS = frozenset(
+    (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"avif", b"avis")
+)
 
 
 def why_not_fetched(file: Path) -> str | None:

@@ -94,6 +94,12 @@ def _property(named: tuple[str, Array]) -> str:
     return f"property {_NAMES[array.dtype.str[1:]]} {name}"
 
 
+_LABEL = re.compile(
+    rb"property[ \t]+u?(?:char|short|int)\d*[ \t]+(\w*(?:label|object|segment|instance|class)\w*)",
+    re.IGNORECASE,
+)
+
+
 def holds_points_alone(content: bytes) -> bool:
     """Whether a PLY has no faces, by its header, which the content need not go beyond."""
     head = _header(content)
@@ -106,6 +112,15 @@ def holds_splats(content: bytes) -> bool:
     mesh's."""
     gaussian = re.search(rb"property[ \t]+\w+[ \t]+(f_dc_0|packed_position)\b", _header(content))
     return gaussian is not None and holds_points_alone(content)
+
+
+def whole_number_of_faces(content: bytes) -> str:
+    """What a whole number of each face is called that may be the label of its object, by the
+    header; "" without one."""
+    head = _header(content)
+    faces = re.search(rb"[\r\n]element[ \t]+face\b(.*?)(?:[\r\n]element|\Z)", head, re.DOTALL)
+    found = _LABEL.search(faces[1]) if faces else None
+    return found[1].decode("ascii", "replace") if found else ""
 
 
 def _header(content: bytes) -> bytes:

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
 from usdbrdf.capture.develop import with_rims
-from usdbrdf.capture.mesh_frames import path_in_capture
+from usdbrdf.capture.mesh_frames import folder_of_masks, path_in_capture
 from usdbrdf.capture.parts import (
     LabelTable,
     as_photographs,
@@ -25,7 +25,7 @@ from usdbrdf.errors import ImageRefused, InputRefused, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
 from usdbrdf.files.naming import composed, ends_of, meant_by, must_be_undistorted, number_at_end
-from usdbrdf.files.paths import contained, seen_of
+from usdbrdf.files.paths import AS_JPEG, contained, is_heif, seen_of
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
@@ -379,10 +379,11 @@ def drop_without_picture(label: str, findings: Findings) -> None:
 def refuse_without_pictures(pictures: Pictures, source: Path) -> None:
     """InputRefused where no picture was found at all."""
     if not pictures.paths:
-        raise InputRefused(
-            f"{source}: no pictures below {pictures.folder}. Put them beside it in a folder "
-            "images, or name their folder with --frames. [capture.frames]"
-        )
+        found = (p for p in seen_of(pictures.folder.rglob("*")) if p.suffix.lower() in _HEIF)
+        how = ". Put them beside it in a folder images, or name their folder with --frames"
+        if heif := next(filter(is_heif, found), None):
+            how = f" that are read: {heif.name} is {AS_JPEG}"
+        raise InputRefused(f"{source}: no pictures below {pictures.folder}{how}. [capture.frames]")
 
 
 def scan_of(
@@ -423,10 +424,11 @@ def scan_of(
             f"{source.name}: {masks} masks are used; what is black there is not looked at. "
             "[capture.mask]"
         )
-    elif (folder / "masks").is_dir() and any(seen_of((folder / "masks").iterdir())):
+    elif unused := folder_of_masks(folder):
+        called = "none of its pictures" if unused == "masks" else "it is not called masks, or none"
         findings.warn(
-            f"{source.name}: nothing is masked: there is a folder masks, but none of its pictures "
-            "is called as one of the frames, or named by it. [capture.mask]"
+            f"{source.name}: nothing is masked: there is a folder {unused}, but {called} is called "
+            "as one of the frames, or named by it. [capture.mask]"
         )
     encoding = options.encoding or encoding
     photographs = refuse_photographs(

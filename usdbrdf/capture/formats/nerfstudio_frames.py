@@ -35,6 +35,8 @@ from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 FILE = "dataparser_transforms.json"
+# What MapAnything's data call what was done to poses, whatever it was.
+_OF_WAI = ("_applied_transform", "_applied_transformation")
 # What its exporters call their meshes, but for mesh.obj, which anybody's may be called.
 EXPORTED = ("poisson_mesh.ply", "tsdf_mesh.ply", "sdf_marching_cubes_mesh.ply")
 # ScanNet++'s keys for the frames it tests with, and of one that is blurred.
@@ -96,14 +98,32 @@ def warn_of_bad(left: int, total: int, document: str, findings: Findings) -> Non
 
 
 def stated_pose(matrix: object) -> Double | None:
-    """(4, 4) of 3 or 4 rows, None where they are no numbers that a pose may have."""
+    """(4, 4) of 3 or 4 rows, or of their numbers in one list; None where they are no numbers that a
+    pose may have."""
     try:
         pose = np.array(matrix, np.float64)
     except (TypeError, ValueError, OverflowError):
         return None
+    if pose.shape in ((12,), (16,)):
+        pose = pose.reshape(-1, 4)
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0.0, 0, 0, 1]])
     return pose if pose.shape == (4, 4) and (np.abs(pose) <= LARGEST_OF_POSE).all() else None
+
+
+def warn_of_moved_by_wai(document: Mapping[str, Any], source: Path, findings: Findings) -> None:
+    """One sentence where a document of MapAnything's data (WAI) says that its poses were moved, by
+    what may be the cameras' axes, a turn of the pictures, or of the world."""
+    for key in _OF_WAI:
+        stated = document.get(key, np.eye(4).tolist())
+        moved, turned = stated_pose(stated), opengl_from_opencv(np.eye(4))
+        plain = moved is not None and any(np.allclose(moved, m) for m in (np.eye(4), turned))
+        if not plain and stated != np.eye(3).tolist():
+            findings.warn(
+                f"{source.name}: {key} says that its poses were moved, and does not say whether in "
+                "the world; the mesh is taken to lie in the frame of the poses as they are. If it "
+                "was made before, call the matrix applied_transform, which is undone. [mesh.frame]"
+            )
 
 
 def rolling_shutter(holder: Mapping[str, Any]) -> list[Any]:

@@ -29,6 +29,7 @@ from usdbrdf.capture.formats.nerfstudio_frames import (
     stated_pose,
     statements_beside,
     warn_of_bad,
+    warn_of_moved_by_wai,
 )
 from usdbrdf.capture.mesh_frames import mesh_beside, scene_above
 from usdbrdf.capture.nerfstudio_lens import focal_of_angle, lens_of_frame, with_skew
@@ -40,6 +41,7 @@ from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.colour import kind_of_encoding, known_encodings
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import MAX_SIDE, image_size
+from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens, whole_sphere
@@ -64,7 +66,8 @@ beside_mesh = statements_beside
 def matches(path: Path) -> bool:
     """A folder with transforms.json, or such a document itself."""
     document = _document(path)
-    return document.suffix == ".json" and document.is_file()
+    is_json = document.suffix == ".json" and document.is_file()
+    return is_json and b'"PinholeCamera' not in beginning_of(document)  # Open3D's
 
 
 def is_surely(path: Path) -> bool:
@@ -120,6 +123,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
 def _geometry(capture: _Capture, findings: Findings) -> ScanGeometry:
     """Of the mesh that the document names, else mesh.ply beside it, else the only one there."""
     options, root = capture.options, capture.source.parent
+    warn_of_moved_by_wai(capture.document, capture.source, findings)
     mesh = options.mesh or _beside(capture, "mesh", "mesh.ply")
     if options.mesh is None and capture.document.get("mesh") in capture.pictured.moved:
         findings.warn(

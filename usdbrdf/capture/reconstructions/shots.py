@@ -59,6 +59,36 @@ class CentredCamera:
         )
 
 
+# A principal point this far from the middle, in parts of a side, is that of another picture, or of
+# one that was turned: those of telephones and of sensors lie within some hundredths.
+_OFF_CENTRE = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnsizedCamera:
+    """A camera whose document says no size of its pictures: they are those that it was made for.
+
+    intrinsics   as in ``ShotCamera``
+    from_bottom  whether the principal point is counted from the lower edge, y up
+    """
+
+    intrinsics: tuple[float, float, float, float]
+    from_bottom: bool = False
+    lens: Lens = PINHOLE
+
+    def of_size(self, width: int, height: int) -> ShotCamera:
+        """ImageRefused for a picture that is plainly none of these."""
+        fx, fy, cx, cy = self.intrinsics
+        cy = height - cy if self.from_bottom else cy
+        if max(abs(cx / width - 0.5), abs(cy / height - 0.5)) > _OFF_CENTRE:
+            raise ImageRefused(
+                f"it is {width} x {height} pixels, but its lens has its axis at {cx:.0f}, "
+                f"{cy:.0f}, as of another size, or of pictures that were cut or turned. "
+                "[capture.size]"
+            )
+        return ShotCamera(resolution=(width, height), intrinsics=(fx, fy, cx, cy), lens=self.lens)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Shot:
     """One photograph of a document.
@@ -72,7 +102,7 @@ class Shot:
     """
 
     name: str
-    camera: ShotCamera | CentredCamera | None
+    camera: ShotCamera | CentredCamera | UnsizedCamera | None
     world_from_camera: Double | None
     problem: str = ""
     mask: str = ""
@@ -172,7 +202,7 @@ def scan_of_shots(
             drop_without_picture(shot.name, findings)
             continue
         camera = shot.camera
-        if isinstance(camera, CentredCamera):
+        if not isinstance(camera, ShotCamera):
             try:
                 camera = camera.of_size(*image_size(image)[:2])
             except ImageRefused as error:
