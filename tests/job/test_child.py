@@ -107,11 +107,11 @@ def in_copy(arrays, parameters):
     in_a_copy(lambda: globals()[parameters["work"]](arrays, parameters))
 
 def spin_in_turns(arrays, parameters):
-    def spin_a_second():
-        while sum(os.times()[:2]) < 1:
+    def spin_awhile():
+        while sum(os.times()[:2]) < 0.7:
             pass
     while True:
-        in_a_copy(spin_a_second)
+        in_a_copy(spin_awhile)
 
 def objects(arrays, parameters):
     return {"x": np.array([object()])}

@@ -234,6 +234,8 @@ def in_a_copy(work: Callable[[], None]) -> None:
     """
     parent, (alarm_s, _) = os.getpid(), signal.getitimer(signal.ITIMER_REAL)
     computing_s = _computing_left()
+    if computing_s == 0:
+        os.kill(os.getpid(), signal.SIGXCPU)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # nobody waits for children where it is ignored
     copy = os.fork()
     if copy == 0:
@@ -274,12 +276,11 @@ def _limit(resource_number: int, most: int | None) -> None:
 
 
 def _computing_left() -> int | None:
-    """Seconds that this process and its copies may still compute."""
+    """Whole seconds that this process and its copies may still compute."""
     soft, _ = resource.getrlimit(resource.RLIMIT_CPU)
     if soft == resource.RLIM_INFINITY:
         return None
-    used = sum(os.times()[:4])
-    return max(1, math.ceil(soft - used))
+    return max(0, math.floor(soft - sum(os.times()[:4])))
 
 
 def _leave(status: int) -> NoReturn:
