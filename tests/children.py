@@ -185,7 +185,8 @@ def _work(request: dict[str, Any], end: int) -> NoReturn:
         sys.path[:], sys.argv = request["path"], ["-c", request["folder"]]
         invalidate_caches()
         tempfile.tempdir = None
-        os.getppid = lambda: int(request["parent"])
+        child, others = os.getpid(), os.getppid
+        os.getppid = lambda: int(request["parent"]) if os.getpid() == child else others()
         os.write(end, _NUMBER.pack(os.getpid()))
         os.close(end)
         product.main()

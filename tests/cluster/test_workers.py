@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -333,6 +334,24 @@ def test_workers_that_do_not_start_are_a_sentence(monkeypatch: pytest.MonkeyPatc
     ):
         pass
     assert len(tries) == 3
+
+
+def test_workers_without_room_for_shared_memory_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dask says no more than that a nanny failed, whatever was behind it."""
+    import distributed
+
+    def dies(**_: object) -> None:
+        try:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        except OSError:
+            raise RuntimeError("Nanny failed to start.")  # noqa: B904
+
+    monkeypatch.setattr(distributed, "LocalCluster", dies)
+    with (
+        pytest.raises(EnvironmentFailure, match=r"No space left.*/dev/shm.*\[cluster.workers\]"),
+        session._local_cluster(2),
+    ):
+        pass
 
 
 STARTED_IN_A_CAPTURE = """

@@ -29,6 +29,7 @@ from usdbrdf.geometry.unwrap import (
     unwrap,
     without_noise,
 )
+from usdbrdf.job.child import run_child
 from usdbrdf.model.scene import Scene, SceneObject
 
 
@@ -346,6 +347,31 @@ def test_an_atlas_too_large_after_that_is_refused(monkeypatch, capsys):
     monkeypatch.setattr(module, "child", crashing)
     with pytest.raises(InputRefused, match=r"\[texturing\.size\]$"):
         unwrap(scene, TexelSizes.even(scene, 0.05))
+
+
+def test_no_atlas_is_destroyed(unwrapped):
+    """xatlas waits there for threads which it may not have woken."""
+    scene, _ = unwrapped
+    sizes = TexelSizes.even(scene, 0.02)
+    sizes.side[0] *= 2  # charts are packed again, in a second atlas
+    expected = unwrap(scene, sizes)
+    given = [obj.first_face for obj in scene.objects], [obj.num_faces for obj in scene.objects]
+    arrays = {"points": scene.points, "triangles": scene.triangles, **sizes._asdict()}
+    arrays |= dict(zip(("first", "count"), map(np.array, given), strict=True))
+    found = run_child(f"{__name__}:with_undying_atlases", arrays, {}, 60, "unwrapping")
+    np.testing.assert_array_equal(found["corner_uv"], expected[0])
+    np.testing.assert_array_equal(found["resolution"], expected[1])
+
+
+def with_undying_atlases(arrays, parameters):
+    import xatlas
+
+    class Undying(xatlas.Atlas):
+        def __del__(self):
+            time.sleep(600)
+
+    xatlas.Atlas = Undying
+    return module.unwrap_objects(arrays, parameters)
 
 
 @pytest.mark.fault("G6")

@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ CHILDREN = """
 import os, resource, signal, sys, tempfile, time
 import numpy as np
 from usdbrdf.errors import InputRefused, UsageError
+from usdbrdf.job.child import in_a_copy, shared_zeros
 
 def double(arrays, parameters):
     print("chatter on stdout")
@@ -87,6 +89,29 @@ def hungry(arrays, parameters):
 def threads(arrays, parameters):
     from threadpoolctl import threadpool_info
     return {"threads": np.array([pool["num_threads"] for pool in threadpool_info()])}
+
+class Undying:
+    def __del__(self):
+        time.sleep(600)
+
+def copies(arrays, parameters):
+    found, undying = shared_zeros((3, 2), np.int64), []
+    def work(i):
+        undying.append(Undying())
+        found[i] = len(undying), os.getpid()
+    for i in range(3):
+        in_a_copy(lambda: work(i))
+    return {"found": found, "own": np.array([os.getpid()])}
+
+def in_copy(arrays, parameters):
+    in_a_copy(lambda: globals()[parameters["work"]](arrays, parameters))
+
+def spin_in_turns(arrays, parameters):
+    def spin_awhile():
+        while sum(os.times()[:2]) < 0.7:
+            pass
+    while True:
+        in_a_copy(spin_awhile)
 
 def objects(arrays, parameters):
     return {"x": np.array([object()])}
@@ -191,6 +216,30 @@ def test_computing_without_end_is_told_from_waiting(child):
         end()
 
 
+def test_copies_leave_with_what_they_made_and_hand_over_what_they_found(child):
+    got = child("copies")
+    assert got["found"][:, 0].tolist() == [1, 1, 1]
+    assert len({*got["found"][:, 1].tolist(), *got["own"].tolist()}) == 4
+
+
+def test_a_child_ends_as_a_copy_of_it_does(child):
+    with pytest.raises(CrashedChild, match=r"crashed \(SIGSEGV\).+about to die"):
+        child("in_copy", work="die", signal="SIGSEGV")
+    with pytest.raises(EnvironmentFailure, match=r"\[child\.killed\]$"):
+        child("in_copy", work="die", signal="SIGKILL")
+    with pytest.raises(InputRefused, match=r"^mesh: no triangles\. \[mesh\.empty\]$"):
+        child("in_copy", work="refuse")
+    with pytest.raises(UsdBrdfError, match=r"ZeroDivisionError.+\[child\.failed\]$"):
+        child("in_copy", work="broken")
+
+
+def test_copies_share_the_time_that_a_child_may_compute(child):
+    crashed = pytest.raises(CrashedChild, match=r"\[child\.endless\]$")
+    beside = partial(module.child, arrays={}, parameters={}, timeout_s=600, label="spinning")
+    with crashed, beside("toy_children:spin_in_turns", cpu_limit_s=4) as end:
+        end()
+
+
 @pytest.mark.fault("R4")
 @pytest.mark.parametrize(("most", "who"), [(None, "limit"), (600, "limit"), (3, "endless")])
 def test_a_limit_of_the_shell_on_computing_is_the_environment(child, tmp_path, most, who):
@@ -214,6 +263,16 @@ def test_a_limit_of_the_shell_on_computing_is_the_environment(child, tmp_path, m
     assert said.startswith("4: " if who == "limit" else "3: "), said
     assert f"[child.{who}]" in said
     assert ("(4 s)" in said and "ulimit -t" in said) == (who == "limit")
+
+
+def test_a_copy_is_ended_with_its_child(child, tmp_path):
+    note = tmp_path / "note"
+    given = {"work": "note", "note": str(note)}
+    with module.child("toy_children:in_copy", {}, given, 600, "beside"):
+        _appears(note)
+        while not note.read_text():
+            time.sleep(0.02)
+    assert _ended(int(note.read_text()))
 
 
 def test_a_child_beside_is_ended_with_the_block(child, tmp_path):

@@ -36,6 +36,8 @@ _LATE = (TimeoutError, asyncio.TimeoutError)
 _NO_FOLDERS = (
     errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL,
 )  # fmt: skip
+# What a folder for shared memory says, /dev/shm, that is full, locked or not there.
+_NO_SHARED_MEMORY = (errno.ENOSPC, errno.EROFS, errno.ENOSYS)
 # Dask looks at every thread's stack a hundred times a second, which takes time from the work.
 _UNWATCHED = {
     "distributed.worker.profile.enabled": False,
@@ -276,11 +278,24 @@ def _started(count: int, environment: Mapping[str, str]) -> Any:
                 )
         except (OSError, RuntimeError, TimeoutError) as error:
             if last:
-                raise EnvironmentFailure(
-                    f"--workers {count}: they do not start on this machine ({error}). Run the same "
-                    "command again, with fewer if memory is short. [cluster.workers]"
-                ) from error
+                raise _no_start(count, error) from error
     raise AssertionError  # not reached
+
+
+def _no_start(count: int, error: BaseException) -> EnvironmentFailure:
+    """With what is behind what Dask says, which is not much."""
+    said, behind = [str(error)], error
+    while (cause := behind.__cause__ or behind.__context__) and cause is not behind:
+        behind = cause
+    if behind is not error:
+        said.append(str(behind) or type(behind).__name__)
+    cure = "Run the same command again, with fewer if memory is short."
+    if isinstance(behind, OSError) and behind.errno in _NO_SHARED_MEMORY:
+        cure = "Make room in /dev/shm, which they share, or leave --workers out."
+    return EnvironmentFailure(
+        f"--workers {count}: they do not start on this machine ({' '.join(said)}). {cure} "
+        "[cluster.workers]"
+    )
 
 
 def _renew(cluster: Any, count: int) -> None:

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from usdbrdf.errors import CrashedChild, EnvironmentFailure, InputRefused
-from usdbrdf.job.child import child
+from usdbrdf.job.child import child, in_a_copy, shared_zeros
 from usdbrdf.job.progress import say, warn
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Array, Double, Float, Int, Long
@@ -42,6 +43,10 @@ _STEPS = 2, 32
 _AT_ONCE = min(4, os.cpu_count() or 1)
 # Triangles for which another one starts: it takes most of a second to import what it needs.
 _FACES_OF_CHILD = 2000
+# Those of this process, which stay (see ``_new_atlas``). Each has a thread for each core, so that
+# a copy of the child makes those of a few small objects, or of one large.
+_ATLASES: list[Any] = []
+_OBJECTS_OF_COPY = max(1, 16 // (os.cpu_count() or 1))
 # A texel's sides on the surface may differ from those wanted by this factor, up or down, on all
 # but a small share of the area.
 _MAX_STRETCH, _MAX_SHARE = 2.0, 0.05
@@ -261,15 +266,24 @@ def _one_by_one(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
 
 
 def unwrap_objects(arrays: Mapping[str, Array], parameters: Mapping[str, Any]) -> dict[str, Array]:
-    """Child process: unwrap each object by itself (see ``unwrap``)."""
+    """Child process: unwrap each object by itself (see ``unwrap``), in copies of this process, with
+    which the threads and the memory of their atlases go."""
     triangles, points = arrays["triangles"], arrays["points"]
-    corner_uv = np.zeros((len(triangles), 3, 2), np.float32)
-    resolution = np.zeros((len(arrays["first"]), 2), np.int32)
-    for i, (first, count) in enumerate(zip(arrays["first"], arrays["count"], strict=True)):
-        faces = slice(int(first), int(first + count))
-        _, own, corners = compact(points, triangles[faces])
-        sizes = TexelSizes(arrays["side"][faces], arrays["pixels"][faces])
-        corner_uv[faces], resolution[i] = _unwrap_one(own, corners, sizes)
+    first, count = arrays["first"], arrays["count"]
+    corner_uv = shared_zeros((len(triangles), 3, 2), np.float32)
+    resolution = shared_zeros((len(count), 2), np.int32)
+
+    def unwrap_each(of_copy: Long) -> None:
+        for i in of_copy:
+            faces = slice(int(first[i]), int(first[i] + count[i]))
+            _, own, corners = compact(points, triangles[faces])
+            sizes = TexelSizes(arrays["side"][faces], arrays["pixels"][faces])
+            corner_uv[faces], resolution[i] = _unwrap_one(own, corners, sizes)
+
+    objects = np.arange(len(count))
+    copy = objects // _OBJECTS_OF_COPY + np.cumsum(count) // _WHOLE
+    for of_copy in np.split(objects, np.flatnonzero(np.diff(copy)) + 1):
+        in_a_copy(partial(unwrap_each, of_copy))
     return {"corner_uv": corner_uv, "resolution": resolution}
 
 
@@ -302,7 +316,7 @@ def _by_xatlas(
     extent = float((high - low).max())
     unit = ((points - low) / max(extent, 1e-12)).astype(np.float32)
     finest = float(sizes.side.min())
-    atlas = xatlas.Atlas()
+    atlas = _new_atlas()
     for part in parts:
         _, own, corners = compact(unit, triangles[part])
         atlas.add_mesh(own, corners.astype(np.uint32))
@@ -365,6 +379,15 @@ def stretched_share(texels: Float, corners: Float, side: Float) -> float:
     odd = ~laid
     odd[laid] = ((stretch > _MAX_STRETCH) | (stretch < 1 / _MAX_STRETCH)).any(axis=1)
     return float(area[odd].sum() / max(area.sum(), 1e-30))
+
+
+def _new_atlas() -> Any:
+    """One that is never destroyed: xatlas would wait for its threads, and may wait for ever (what
+    wakes one that is about to sleep is lost)."""
+    import xatlas
+
+    _ATLASES.append(xatlas.Atlas())
+    return _ATLASES[-1]
 
 
 def _laid_out(atlas: Any, parts: Sequence[Long]) -> tuple[Float, Long] | None:
@@ -437,7 +460,7 @@ def _at_own_densities(
     start = np.cumsum(wide) - wide
     placed = (texels - low[of_vertex]) * scale[of_vertex, None]
     placed[:, 0] += start[of_vertex]
-    packed = xatlas.Atlas()
+    packed = _new_atlas()
     packed.add_uv_mesh(placed.astype(np.float32), corners.astype(np.uint32))
     options.texels_per_unit = 1.0
     packed.generate(xatlas.ChartOptions(), options)

@@ -12,6 +12,7 @@ import ctypes
 import errno
 import json
 import math
+import mmap
 import os
 import resource
 import signal
@@ -24,6 +25,8 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
+
+import numpy as np
 
 from usdbrdf import errors
 from usdbrdf.errors import CrashedChild, EnvironmentFailure, LateChild, UsdBrdfError
@@ -194,11 +197,7 @@ def main() -> None:
     """The child's side: read the task, call the function, leave its result or its error."""
     folder = Path(sys.argv[1])
     task = json.loads((folder / "task.json").read_text("utf-8"))
-    # The kernel kills this process when its parent dies, which may have happened already.
-    with suppress(OSError, AttributeError):  # another system than Linux
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != task["parent"]:
-        os.kill(os.getpid(), signal.SIGKILL)
+    _die_with(task["parent"])
     signal.alarm(task["alarm_s"])
     _limit(resource.RLIMIT_AS, task["memory_limit_bytes"])
     _limit(resource.RLIMIT_CPU, task["cpu_limit_s"])
@@ -227,6 +226,46 @@ def main() -> None:
     _leave(0)
 
 
+def in_a_copy(work: Callable[[], None]) -> None:
+    """Have a copy of this process, a child without threads, do a piece of its work: it leaves
+    without the destructors of what it made, and with its memory and its threads. What it finds, it
+    writes into ``shared_zeros``. This process ends as the copy does, if that is otherwise than
+    well; the limits that are left here hold there, and so does what ``main`` does of errors.
+    """
+    parent, (alarm_s, _) = os.getpid(), signal.getitimer(signal.ITIMER_REAL)
+    computing_s = _computing_left()
+    if computing_s == 0:
+        os.kill(os.getpid(), signal.SIGXCPU)
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # nobody waits for children where it is ignored
+    copy = os.fork()
+    if copy == 0:
+        _die_with(parent)
+        signal.setitimer(signal.ITIMER_REAL, alarm_s)
+        _limit(resource.RLIMIT_CPU, computing_s)
+        work()
+        _leave(0)
+    status = os.waitstatus_to_exitcode(os.waitpid(copy, 0)[1])
+    if status < 0:
+        os.kill(os.getpid(), -status)
+    if status:
+        _leave(status)
+
+
+def shared_zeros(shape: tuple[int, ...], kind: type[np.generic]) -> Array:
+    """An array in memory that this process shares with copies of it."""
+    count = math.prod(shape)
+    memory = mmap.mmap(-1, max(1, count) * np.dtype(kind).itemsize)
+    return np.frombuffer(memory, kind, count).reshape(shape)
+
+
+def _die_with(parent: int) -> None:
+    """The kernel kills this process when its parent dies, which may have happened already."""
+    with suppress(OSError, AttributeError):  # another system than Linux
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
 def _limit(resource_number: int, most: int | None) -> None:
     """Lower a limit of this process to so much, unless the shell's is lower. The hard one stays:
     who reaches that of computing is killed without a word."""
@@ -234,6 +273,14 @@ def _limit(resource_number: int, most: int | None) -> None:
         soft, hard = resource.getrlimit(resource_number)
         limit = min(limit for limit in (most, soft, hard) if limit != resource.RLIM_INFINITY)
         resource.setrlimit(resource_number, (limit, hard))
+
+
+def _computing_left() -> int | None:
+    """Whole seconds that this process and its copies may still compute."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_CPU)
+    if soft == resource.RLIM_INFINITY:
+        return None
+    return max(0, math.floor(soft - sum(os.times()[:4])))
 
 
 def _leave(status: int) -> NoReturn:
