@@ -15,6 +15,7 @@ from usdbrdf.geometry.sides import (
     connected_windings,
     sides_from_cameras,
     turned_towards_cameras,
+    with_backs,
 )
 from usdbrdf.model.mesh import ScanMesh, face_normals_and_angles
 from usdbrdf.options import IngestOptions
@@ -44,7 +45,8 @@ def room():
 
 
 def _sides(mesh, cameras):
-    return sides_from_cameras(mesh, RayScene(mesh.points, mesh.triangles), cameras)
+    rays = RayScene(mesh.points, mesh.triangles)
+    return with_backs(sides_from_cameras(mesh, rays, cameras), mesh, rays, referenced=False)
 
 
 def _wound(mesh, turned):
@@ -142,7 +144,63 @@ def test_the_back_of_a_sheet_that_faces_what_frames_see_is_a_surface_of_its_own(
     assert len(skinned.triangles) == len(mesh.triangles) + sides.skins.sum()
     normals = face_normals_and_angles(skinned.points, skinned.triangles)[0]
     np.testing.assert_allclose(normals[-2:], [[0, -1, 0]] * 2, atol=1e-6)
-    assert not sides.of_one_skin().skins.any()
+    rays = RayScene(mesh.points, mesh.triangles)
+    assert not with_backs(sides, mesh, rays, referenced=True).skins.any()
+
+
+def _sofa(noise: float):
+    """Front, top and two sides, open behind and below, before a wall; several thousand faces."""
+    rng = np.random.default_rng(2)
+    n = 24
+    u, v = (one.ravel() for one in np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n)))
+    corner, wide, deep, high = np.array([1.0, 0.1, 0.0]), 2.0, 0.8, 0.7
+    o = np.zeros_like(u)
+    sheets = [
+        np.stack([wide * u, o + deep, high * v], axis=1),
+        np.stack([wide * u, deep * v, o + high], axis=1),
+        np.stack([o, deep * u, high * v], axis=1),
+        np.stack([o + wide, deep * u, high * v], axis=1),
+    ]
+    cell = np.arange((n - 1) * n).reshape(n - 1, n)[:, :-1].ravel()
+    quads = np.stack([cell, cell + 1, cell + n, cell + 1, cell + n + 1, cell + n], axis=1)
+    one = quads.reshape(-1, 3)
+    faces = np.concatenate([one + k * n * n for k in range(len(sheets))])
+    points = np.concatenate(sheets) + corner
+    # What was shared stays so.
+    rounded = np.unique(points.round(6), axis=0, return_inverse=True)[1].ravel()
+    points += noise * rng.standard_normal((rounded.max() + 1, 3))[rounded]
+    return points.astype(np.float32), faces.astype(np.int32)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_what_hangs_together_has_a_back_as_a_whole_or_none(noise: float):
+    """A patchwork of second skins would let light through the gaps, and its charts need room."""
+    points, triangles, face_object, names = room_mesh()
+    more, faces = _sofa(noise)
+    mesh = _mesh(
+        np.concatenate([points, more]),
+        np.concatenate([triangles, len(points) + faces]),
+        np.append(face_object, np.full(len(faces), len(names))).astype(np.int32),
+    )
+    sides = _sides(mesh, _cameras(ring_of_poses(12)))
+    sofa = sides.skins[len(triangles) :] & ~sides.both[len(triangles) :]
+    assert sofa.mean() in (0, 1)
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-5, 1e-4])
+def test_a_sheet_whose_back_the_file_has_gets_no_other(gap: float):
+    points, triangles, face_object, names = room_mesh()
+    sheet = np.float32([[1, 0.4, 1], [3, 0.4, 1], [3, 0.4, 2], [1, 0.4, 2]])
+    behind = sheet - np.float32([0, gap, 0])
+    number = np.int32([[0, 2, 1], [0, 3, 2]])
+    mesh = _mesh(
+        np.concatenate([points, sheet, behind]),
+        np.concatenate([triangles, len(points) + number, len(points) + 4 + number[:, ::-1]]),
+        np.append(face_object, [len(names)] * 4).astype(np.int32),
+    )
+    places = [(2.0 + 0.1 * k, 2.5, 1.5) for k in range(5)]
+    poses = [look_at(np.array(place), np.array([2.0, 0, 1.5])) for place in places]
+    assert not _sides(mesh, _cameras(poses)).skins[-4:].any()
 
 
 def test_normals_turn_with_their_faces_and_missing_ones_are_made(room):

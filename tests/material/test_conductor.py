@@ -138,6 +138,32 @@ def test_a_lamp_that_rays_find_and_the_frame_does_not_show_is_no_evidence():
     np.testing.assert_allclose(metal.f0, F0, atol=0.03)
 
 
+@pytest.mark.parametrize("f0", [(0.95, 0.75, 0.35), (0.95, 0.6, 0.05), (0.05, 0.6, 0.95)])
+def test_each_channel_has_a_reflectance_of_its_own_beside_lamps_of_a_hundred_times(f0):
+    """Rays to lamps are noisy; what one channel settles at from a start another does not."""
+    rng = np.random.default_rng(5)
+    mirrored = rng.uniform(0.2, 0.6, (len(TEXEL), 3)) * np.where(
+        rng.random((len(TEXEL), 1)) < 0.3, 100.0, 1.0
+    )
+
+    def basis(seed: int):
+        noise = np.random.default_rng(seed).standard_normal((len(TEXEL), 3))
+
+        def of_phis(phis: Any) -> tuple[np.ndarray, np.ndarray]:
+            sharp = np.exp(-np.abs(np.log(np.maximum(np.asarray(phis), 1e-3) / PHI)))
+            seen = (mirrored * (1 + 0.2 * noise))[..., None] * sharp + mirrored.mean() * (1 - sharp)
+            return np.zeros_like(seen, np.float32), (F0_OF_PSI * seen).astype(np.float32)
+
+        return of_phis
+
+    light = np.full((len(TEXEL), 3), 1.5, np.float32)
+    dielectric = LobeEstimate(PHI, 1.0, 0.02, 0.1, 0.0, 1.0, 0.9)
+    radiance = (np.array(f0) * mirrored).astype(np.float32)
+    metal = conductor_of(radiance, TEXEL, light, (basis(2), basis(3)), dielectric, certain=True)
+    assert metal is not None
+    np.testing.assert_allclose(metal.f0, f0, atol=0.08)
+
+
 def test_the_roughest_metal_is_told_by_nobody_but_a_person():
     rough = (0.01 + F0) * _incident(1)
     assert _found(rough, 1.0, phi=0.67) is not None

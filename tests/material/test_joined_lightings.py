@@ -76,7 +76,8 @@ def doubted(monkeypatch: pytest.MonkeyPatch) -> Any:
         asked.clear()
 
         def error(_sampled: Any, *lobe: Any) -> float:
-            asked.append(lobe)
+            *kind, tint = lobe
+            asked.append((*kind, *tint.ravel().tolist()))
             return off
 
         monkeypatch.setattr(doubt_of_light, "error_by_doubt", error)
@@ -88,7 +89,7 @@ def doubted(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_doubts_of_light_add_to_the_error_of_psi_up_to_where_nothing_is_known(doubted: Any):
     found, metal, asked = doubted(0.04, FOUND)
     assert metal is None
-    assert asked == [(DIELECTRIC, 0.2, 0.5, 7)]
+    assert asked == [(DIELECTRIC, 0.2, 0.5, 7, 1, 1, 1)]
     # 1.645 standard deviations of that beside what the samples left.
     upper = 0.5 + math.hypot(0.05, 1.645 * 0.04)
     assert found == FOUND._replace(psi_error=pytest.approx(0.05), psi_upper=pytest.approx(upper))
@@ -111,7 +112,7 @@ def test_where_psi_is_badly_known_anyway_nothing_is_traced(doubted: Any):
     badly = FOUND._replace(psi_error=1.2 * MAX_PSI_ERROR)
     found, doubtful, asked = doubted(0.3, badly, metal)
     psi = 0.9 / F0_OF_PSI
-    assert asked == [(CONDUCTOR, 0.1, pytest.approx(psi), 7)]
+    assert asked == [(CONDUCTOR, 0.1, *map(pytest.approx, (psi, 7, 1, 8 / 9, 7 / 9)))]
     assert doubtful == metal._replace(f0_error=pytest.approx(math.hypot(0.03, F0_OF_PSI * 0.3)))
     # As much as that is of the metal's own psi.
     assert found.psi_error == pytest.approx(math.hypot(badly.psi_error, 0.3 * 0.5 / psi))

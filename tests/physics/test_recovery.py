@@ -282,7 +282,7 @@ def test_psi_is_known_no_better_than_the_lamp_that_is_mirrored(studio: Studio, v
     found, _ = fit_views(lit.lobe, lambda: views.sampled(lit), 0)
     off = 0.3
     sampled = views.sampled(lit, only(off * views.radiance))
-    error = error_by_doubt(sampled, lit.lobe, found.phi, found.psi, 0)
+    error = error_by_doubt(sampled, lit.lobe, found.phi, found.psi, 0, np.ones((3, 1), np.float32))
     # Most of the highlight is the lamp's, at grazing angles whatever psi is.
     assert 0.6 * off * found.psi < error < 1.3 * off * found.psi
     brighter = _lit_scene(world, np.where(lamp, 1 + off, 1) * views.radiance)

@@ -329,6 +329,23 @@ def test_where_the_sun_falls_on_a_floor_it_is_asked_with_its_bound(tmp_path: Pat
     np.testing.assert_allclose(asked[-1].reflected[asked[-1].clipped], np.pi * SATURATION)
 
 
+def test_what_a_second_look_refutes_is_not_kept_and_what_it_does_not_tell_is():
+    def told(multiplier, error, determined):
+        return EstimatedRadiance(
+            multiplier=np.repeat([multiplier], 3, axis=0).T,
+            standard_error=np.repeat([error], 3, axis=0).T,
+            determined=np.array(determined),
+        )
+
+    first = told([3.0, 3.0, 3.0], [0.4, 0.4, 0.4], [True, True, True])
+    # Darker than its bound for sure; told by too little; told anew.
+    second = told([1.0, 0.2, 5.0], [0.2, 2.0, 0.3], [False, False, True])
+    both = second.else_of(first)
+    assert both.determined.tolist() == [False, True, True]
+    assert both.multiplier[:, 0].tolist() == [1.0, 3.0, 5.0]
+    assert both.standard_error[:, 0].tolist() == [0.2, 0.4, 0.3]
+
+
 def test_a_lamp_that_only_the_first_round_tells_stays_as_that_tells_it(
     beside_table: InTheSun, tmp_path: Path, monkeypatch
 ):

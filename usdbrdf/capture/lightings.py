@@ -17,7 +17,7 @@ import numpy as np
 from usdbrdf.capture.native import captured_faces, captured_points
 from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.naming import identifier_from
-from usdbrdf.geometry.sides import sides_from_cameras, turned_towards_cameras
+from usdbrdf.geometry.sides import sides_from_cameras, turned_towards_cameras, with_backs
 from usdbrdf.model.capture import Frames, Scan, recorded_together
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.options import IngestOptions
@@ -87,8 +87,8 @@ def scan_of_lightings(scans: Mapping[str, Scan], crease_angle_deg: float) -> Sca
     )
     rays = RayScene(mesh.points, mesh.triangles)
     sides = sides_from_cameras(mesh, rays, (frames.camera(i) for i in range(len(frames))))
-    if first.usd_geometry is not None:
-        sides = sides.of_one_skin()
+    referenced = first.usd_geometry is not None
+    sides = with_backs(sides, mesh, rays, referenced=referenced)
     turned = np.zeros(len(triangles), np.bool_)
     turned = turned if first.turned_faces is None else first.turned_faces
     counts = Counter[str]()

@@ -39,7 +39,7 @@ from usdbrdf.files.images import MAX_SIDE
 from usdbrdf.files.naming import unique_identifiers
 from usdbrdf.geometry.mesh_clean import clean_mesh
 from usdbrdf.geometry.normals import corner_normals
-from usdbrdf.geometry.sides import Sides, sides_from_cameras, turned_towards_cameras
+from usdbrdf.geometry.sides import Sides, sides_from_cameras, turned_towards_cameras, with_backs
 from usdbrdf.geometry.unwrap import connected_triangles
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Int, Long
@@ -432,17 +432,17 @@ def _sides(
     outside = drop_cameras_inside(frames, geometry.mesh, rays, sides, names, findings)
     if 0 < len(outside) < len(frames):
         sides = seen(frames.at(outside))
-    turned, both = int(sides.turned.sum()), int(sides.skins.sum())
+    # A face of a mesh that is referenced keeps the side that is seen more.
+    referenced = geometry.usd_geometry is not None
+    sides = with_backs(sides, geometry.mesh, rays, referenced=referenced)
+    turned = int(sides.turned.sum())
     findings.count("faces_turned", turned)
-    findings.count("faces_of_two_sides", both)
+    findings.count("faces_of_two_sides", int(sides.skins.sum()))
     if turned:
         findings.warn(
             f"{turned} of {len(sides.turned)} faces are wound away from the cameras and have been "
             "turned in the asset; the mesh stays as it is. [mesh.winding]"
         )
-    if both and geometry.usd_geometry is not None:
-        # Nothing is added to meshes that are referenced: such a face keeps the side seen more.
-        sides = sides.of_one_skin()
     return sides, outside
 
 

@@ -29,8 +29,6 @@ _PIXELS, _FRAMES_OF_EACH = 2, 2
 _MOST_ACROSS = 1024
 # Faces of an unseen part that look around, and in how many directions from either side.
 _LOOKING, _DIRECTIONS = 16, 16
-# In so many of them nothing is told from something.
-_FIRST_LOOK = 4
 # The second skin lies so far behind the first, as a share of the scene's diagonal: further than
 # rays start above a surface.
 _BEHIND = 4e-5
@@ -61,7 +59,7 @@ class Sides:
     """turned, both (F,) bool: the winding shows the wrong side; frames see either side.
 
     frames  (F, 2) int32: how many of them see the front, which the winding tells, and the back
-    faces_room  (F,) bool: so does the back, of a thin thing, which no frame sees
+    faces_room  (F,) bool: the back, which no frame sees, faces what they see all the same
     """
 
     turned: Bool
@@ -73,11 +71,6 @@ class Sides:
     def skins(self) -> Bool:
         """(F,): the back is a surface of its own, with light of its own."""
         return self.both | self.faces_room
-
-    def of_one_skin(self) -> Sides:
-        """The same where nothing can be put behind the mesh."""
-        none = np.zeros_like(self.both)
-        return replace(self, both=none, faces_room=none)
 
 
 def sides_from_cameras(mesh: ScanMesh, rays: RayScene, cameras: Iterable[Camera]) -> Sides:
@@ -96,12 +89,32 @@ def sides_from_cameras(mesh: ScanMesh, rays: RayScene, cameras: Iterable[Camera]
         facing = np.where(
             lost, _looking_around(mesh, rays, normals, lost, shown, part, agrees), facing
         )
-    turned = facing < 0
-    alone = np.flatnonzero((seen.pixels >= _PIXELS).any(axis=1) & ~seen.both)
-    faces_room = np.zeros(len(turned), np.bool_)
-    front = np.where(turned, -1.0, 1.0)[:, None] * normals
-    faces_room[alone] = _backs_in_room(mesh, rays, alone, front, seen.both)
-    return Sides(turned=turned, both=seen.both, frames=seen.frames, faces_room=faces_room)
+    nothing = np.zeros(len(facing), np.bool_)
+    return Sides(turned=facing < 0, both=seen.both, frames=seen.frames, faces_room=nothing)
+
+
+def with_backs(sides: Sides, mesh: ScanMesh, rays: RayScene, *, referenced: bool) -> Sides:
+    """The sides, and the backs of thin things that stand in the room: most of what lies behind the
+    faces of such a part, as they hang together, shows its front, or has two. Behind what is closed,
+    and around a room, it is insides and nothing; and a back that the file has lies closer than a
+    second skin. Behind a mesh that is ``referenced`` nothing is put, whose faces have one side.
+
+    Parts are judged whole: half of a thing's back would let light through the other half.
+    """
+    if referenced:
+        nothing = np.zeros_like(sides.both)
+        return replace(sides, both=nothing, faces_room=nothing)
+    part, _ = connected_windings(mesh)
+    seen = np.bincount(part, sides.frames.any(axis=1)) > 0
+    some = _some_of_each_part(part, doubled_areas(mesh.points, mesh.triangles))
+    some = some[seen[part[some]]]
+    front = np.where(sides.turned, -1.0, 1.0)[:, None] * mesh.face_normals
+    behind = _share_behind(mesh, rays, some, front, sides.both)
+    alone = ~_has_back(mesh, rays, some, front[some])
+    count = int(part.max()) + 1
+    share = np.bincount(part[some], behind * alone, count)
+    in_room = share > np.bincount(part[some], minlength=count) / 2
+    return replace(sides, faces_room=in_room[part] & ~sides.both)
 
 
 def sightings(rays: RayScene, normals: Double, cameras: Iterable[Camera]) -> Sightings:
@@ -232,23 +245,45 @@ def _looking_around(
     return np.where(of_part[part] == 0, 1, np.where(agrees, 1, -1) * of_part[part]).astype(np.int64)
 
 
-def _backs_in_room(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double, both: Bool) -> Bool:
-    """(N,) of ``faces``: most of what lies behind each of them shows its ``front`` (F, 3), or has
-    two. In what is closed, and around a room, it is insides and nothing."""
+def _some_of_each_part(part: Long, area: Double) -> Long:
+    """Of each part (F,) at most ``_LOOKING`` faces, evenly by their area."""
+    order = np.argsort(part, kind="stable")
+    own = part[order]
+    size = np.maximum(area[order], 1e-30 * max(float(area.max()), 1e-300))
+    total = np.bincount(own, size)
+    upto = np.cumsum(size) - np.concatenate([[0.0], np.cumsum(total)])[own]
+    step = np.floor(_LOOKING * np.clip(upto / total[own], 0, 1 - 1e-9))
+    last = np.flatnonzero(np.diff(own * _LOOKING + step, append=np.inf) > 0)
+    return np.asarray(order[last])
+
+
+def _share_behind(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double, both: Bool) -> Double:
+    """(N,) of ``faces``: of what lies around the back of each, what shows its ``front`` (F, 3) or
+    has ``both`` (F,)."""
     diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-    corner = mesh.points.astype(np.float64)[mesh.triangles[faces]]
-    score, left = np.zeros(len(faces)), np.arange(len(faces))
-    for number, direction in enumerate(_even_directions(_DIRECTIONS)):
-        # Near each corner in turn, that faces which reach under something are not judged by that.
-        place = (corner[left].sum(axis=1) + corner[left, number % 3]) / 4
-        out = -front[faces[left]]
+    centre = mesh.points.astype(np.float64)[mesh.triangles[faces]].mean(axis=1)
+    out, share = -front[faces], np.zeros(len(faces))
+    origin = lift_from_surface(centre.astype(np.float32), out.astype(np.float32), diagonal)
+    for direction in _even_directions(_DIRECTIONS):
         way = direction * np.where((out @ direction)[:, None] < 0, -1.0, 1.0)
-        origin = lift_from_surface(place.astype(np.float32), out.astype(np.float32), diagonal)
         hit = rays.closest(origin, np.ascontiguousarray(way, np.float32)).face
-        score[left] += (hit >= 0) & (((way * front[hit]).sum(axis=1) < 0) | both[hit])
-        if number == _FIRST_LOOK - 1:
-            left = np.flatnonzero(score > 0)
-    return np.asarray(score > _DIRECTIONS / 2, np.bool_)
+        shows = ((way * front[hit]).sum(axis=1) < 0) | both[hit]
+        share += (hit >= 0) & shows
+    return share / _DIRECTIONS
+
+
+def _has_back(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double) -> Bool:
+    """(N,) of ``faces`` with their ``front`` (N, 3): behind each lies another face where its second
+    skin would, or before that."""
+    diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
+    corner = np.sort(welded_ids(mesh.points)[mesh.triangles], axis=1)
+    _, same, times = np.unique(corner, axis=0, return_inverse=True, return_counts=True)
+    twice = times[same.reshape(-1)][faces] > 1
+    centre = mesh.points.astype(np.float64)[mesh.triangles[faces]].mean(axis=1)
+    origin = (centre - 2 * _BEHIND * diagonal * front).astype(np.float32)
+    hits = rays.closest(origin, np.ascontiguousarray(front, np.float32))
+    other = (hits.face >= 0) & (hits.face != faces) & (hits.distance < 2 * _BEHIND * diagonal)
+    return np.asarray(twice | other, np.bool_)
 
 
 def _even_directions(count: int) -> Double:
@@ -280,10 +315,10 @@ def turned_towards_cameras(
     return _with_second_skin(turned, sides.skins) if sides.skins.any() else turned
 
 
-def _with_second_skin(mesh: ScanMesh, both: Bool) -> ScanMesh:
-    """The faces ``both`` (F,) once more, seen from behind and a little behind themselves."""
-    corner = mesh.points[mesh.triangles[both]]
-    normal = face_normals_and_angles(mesh.points, mesh.triangles[both])[0]
+def _with_second_skin(mesh: ScanMesh, skins: Bool) -> ScanMesh:
+    """The faces ``skins`` (F,) once more, seen from behind and a little behind themselves."""
+    corner = mesh.points[mesh.triangles[skins]]
+    normal = face_normals_and_angles(mesh.points, mesh.triangles[skins])[0]
     diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
     behind = corner - (_BEHIND * diagonal) * normal[:, None].astype(np.float32)
     number = len(mesh.points) + np.arange(3 * len(corner), dtype=np.int32).reshape(-1, 3)
@@ -292,7 +327,7 @@ def _with_second_skin(mesh: ScanMesh, both: Bool) -> ScanMesh:
         points=np.concatenate([mesh.points, behind.reshape(-1, 3).astype(np.float32)]),
         triangles=np.concatenate([mesh.triangles, number[:, [0, 2, 1]]]),
         corner_normals=np.concatenate(
-            [mesh.corner_normals, -mesh.corner_normals[both][:, [0, 2, 1]]]
+            [mesh.corner_normals, -mesh.corner_normals[skins][:, [0, 2, 1]]]
         ),
-        face_object=np.concatenate([mesh.face_object, mesh.face_object[both]]),
+        face_object=np.concatenate([mesh.face_object, mesh.face_object[skins]]),
     )

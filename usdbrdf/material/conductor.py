@@ -81,7 +81,7 @@ def conductor_of(
     found = [_relative(basis([dielectric.phi]), level) for basis in of_dielectric or bases]
     psi = dielectric.psi * F0_OF_PSI
     one, other = ((base + psi * slope)[..., 0] for base, slope in found)
-    diffuse = irradiance / level
+    diffuse = irradiance / np.pi / level
     albedo = _least_squares(seen, (one, other), (diffuse, diffuse))
     rests = seen - one, seen - other
     uniform = _size(*(rest - albedo * diffuse for rest in rests))
@@ -126,20 +126,18 @@ def _least_squares(
     # One ray that finds a lamp which the frame does not show would outweigh all else.
     shown, product = slope[0] + slope[1], slope[0] * slope[1]
     of_seen = ((seen - base[0]) * slope[1] + (seen - base[1]) * slope[0]) / 2
-    found = []
-    for start in _STARTS:
+    found, left = np.zeros((len(_STARTS), 3)), np.zeros((len(_STARTS), 3))
+    for k, start in enumerate(_STARTS):
         f0 = np.full(3, start)
         for _ in range(8):
             off = seen - (base[0] + base[1] + f0 * shown) / 2
             used = np.abs(off) < _FURTHEST
-            f0 = np.clip((used * of_seen).sum(axis=0) / _positive(used * product), 0, 1)
-        size = _size(*(seen - b - f0 * s for b, s in zip(base, slope, strict=True)))
-        found.append((size, f0))
-    return np.asarray(min(found, key=lambda one: one[0])[1])
-
-
-def _positive(values: Double) -> Double:
-    return np.asarray(np.maximum(values.sum(axis=0), 1e-12))
+            squares = (used * product).sum(axis=0)
+            told = (used * of_seen).sum(axis=0) / np.maximum(squares, 1e-12)
+            f0 = np.where(squares > 0, np.clip(told, 0, 1), f0)
+        one, other = (_cut(seen - b - f0 * s) for b, s in zip(base, slope, strict=True))
+        found[k], left[k] = f0, (one * other).mean(axis=0)
+    return found[left.argmin(axis=0), range(3)]
 
 
 def _without_means(values: Double, texel: Long, views: Long) -> Double:
@@ -149,5 +147,8 @@ def _without_means(values: Double, texel: Long, views: Long) -> Double:
 
 def _size(first: Double, second: Double) -> float:
     """Root mean square of what a model leaves, from two predictions with independent noise."""
-    cut = [np.clip(rest, -_FURTHEST, _FURTHEST) for rest in (first, second)]
-    return max(math.sqrt(max(float((cut[0] * cut[1]).mean()), 0.0)), _LEAST_ERROR)
+    return max(math.sqrt(max(float((_cut(first) * _cut(second)).mean()), 0.0)), _LEAST_ERROR)
+
+
+def _cut(rest: Double) -> Double:
+    return np.clip(rest, -_FURTHEST, _FURTHEST)

@@ -8,9 +8,10 @@ from collections.abc import Callable
 import numpy as np
 
 from usdbrdf.material.conductor import Conductor
-from usdbrdf.material.fit_views import SampledObject, of_metal
+from usdbrdf.material.fit_views import SampledObject, of_metal, tint_of
 from usdbrdf.material.verdict import MAX_PSI_ERROR, NOTHING_KNOWN, SOME_EVIDENCE, LobeEstimate
 from usdbrdf.material.view_model import UPDATES, ViewModel
+from usdbrdf.model.arrays import Float
 from usdbrdf.transport.brdf import F0_OF_PSI
 
 _UPPER = 1.645  # standard deviations that are exceeded with a probability of 5 %
@@ -34,7 +35,8 @@ def with_doubts_of_light(
     kind, phi, psi = lobe, found.phi, found.psi
     if metal is not None:
         kind, phi, psi = of_metal(lobe), metal.phi, max(metal.f0) / F0_OF_PSI
-    off = error_by_doubt(sampled(), kind, phi, psi, seed)
+    tint = tint_of(metal) if metal is not None else np.ones((3, 1), np.float32)
+    off = error_by_doubt(sampled(), kind, phi, psi, seed, tint)
     if metal is not None:
         error = min(math.hypot(metal.f0_error, F0_OF_PSI * off), float(NOTHING_KNOWN))
         metal = metal._replace(f0_error=error)
@@ -45,16 +47,24 @@ def with_doubts_of_light(
     return found._replace(psi_error=psi_error, psi_upper=upper), metal
 
 
-def error_by_doubt(sampled: SampledObject, kind: int, phi: float, psi: float, seed: int) -> float:
+def error_by_doubt(
+    sampled: SampledObject, kind: int, phi: float, psi: float, seed: int, tint: Float
+) -> float:
     """By how much psi would be off if all light were by its standard error: what a lobe would then
-    mirror more, or less, as the samples tell psi; psi itself where they do not."""
+    mirror more, or less, as the samples tell psi; psi itself where they do not. tint (3, 1): of
+    what is mirrored."""
     model = ViewModel(sampled.samples)
     first = 3 * (_SEED_OF_DOUBT + seed)
-    lobes = [sampled.lobe(kind, phi, first + n) for n in range(2)]
+
+    def lobe(own_seed: int, *, of_doubt: bool = False) -> tuple[Float, Float]:
+        base, slope = sampled.lobe(kind, phi, own_seed, of_doubt=of_doubt)
+        return base, tint * slope
+
+    lobes = [lobe(first + n) for n in range(2)]
     shown = np.mean([base + np.float32(psi) * slope for base, slope in lobes], axis=0)[..., 0]
     for _ in range(UPDATES):
         model.update(shown)
-    base, slope = sampled.lobe(kind, phi, first + 2, of_doubt=True)
+    base, slope = lobe(first + 2, of_doubt=True)
     slopes = [slope for _, slope in lobes]
     values = np.concatenate([*slopes, base + np.float32(psi) * slope], axis=2)
     one, other, doubt = model.reduced(values).parts(3)

@@ -330,6 +330,11 @@ def with_what_shows_through(
     return found._replace(contradiction=max(found.contradiction, through))
 
 
+def tint_of(metal: Conductor) -> Float:
+    """(3, 1): its reflectance in units of that of the channel that it reflects most of."""
+    return (np.array(metal.f0, np.float32) / np.float32(max(metal.f0)))[:, None]
+
+
 def metal_if_opaque(
     lobe: int,
     sampled: Callable[[], SampledObject],
@@ -344,7 +349,7 @@ def metal_if_opaque(
     held, kind = sampled(), of_metal(lobe)
     of_kind = held.basis(0, 3 * (_SEED_OF_THROUGH + seed))
     strongest = max(metal.f0)
-    tint = (np.array(metal.f0, np.float32) / np.float32(strongest))[:, None]
+    tint = tint_of(metal)
 
     def basis(phis: Sequence[float]) -> tuple[Float, Float]:
         base, slope = of_kind(kind, phis)

@@ -264,8 +264,9 @@ class EstimatedRadiance:
         )
 
     def else_of(self, other: EstimatedRadiance) -> EstimatedRadiance:
-        """Of those of the lamps (K,) that are determined in the ``other`` alone what that tells."""
-        which = other.determined & ~self.determined
+        """Of those of the lamps (K,) of which this tells too little what is determined in the
+        ``other``; what this tells to be no lamp stays so."""
+        which = other.determined & (self.standard_error.max(axis=1) > MAX_ERROR)
         return EstimatedRadiance(
             multiplier=np.where(which[:, None], other.multiplier, self.multiplier),
             standard_error=np.where(which[:, None], other.standard_error, self.standard_error),
