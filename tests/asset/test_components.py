@@ -165,6 +165,34 @@ def test_pivots_are_in_the_middle_of_the_lower_side(tmp_path, synthetic, unit, u
     np.testing.assert_array_equal(scene.corner_normals, scan.mesh.corner_normals[order])
 
 
+def test_a_board_on_a_sheet_has_points_of_its_own(tmp_path, synthetic):
+    """Blender's Cycles lights all corners of a point by the normal of one of them: a wall that met
+    a floor and a third face at an edge was black."""
+    scan = synthetic.make_scan(tmp_path / "capture")
+    mesh = scan.mesh
+    item = components_of(scan)[0]
+    one, two = item.triangles[0, :2]
+    first = np.flatnonzero(mesh.face_object == 0)[0]
+    a, b = mesh.triangles[first, :2]
+    normal = np.cross(mesh.points[b] - mesh.points[a], mesh.corner_normals[first, 0])
+    board = replace(
+        mesh,
+        points=np.concatenate([mesh.points, mesh.points[[a]] + mesh.corner_normals[[first], 0]]),
+        triangles=np.concatenate([mesh.triangles, [[b, a, len(mesh.points)]]]).astype(np.int32),
+        corner_normals=np.concatenate(
+            [mesh.corner_normals, np.broadcast_to(normal, (1, 3, 3)).astype(np.float32)]
+        ),
+        face_object=np.append(mesh.face_object, mesh.face_object[first]),
+    )
+    made = components_of(replace(scan, mesh=board))[0]
+    assert len(made.triangles) == len(item.triangles) + 1
+    assert not np.isin(made.triangles[-1], made.triangles[:-1]).any()
+    ours = item.points + item.pivot.astype(np.float32)
+    theirs = made.points + made.pivot.astype(np.float32)
+    np.testing.assert_allclose(theirs[made.triangles[:-1]], ours[item.triangles], atol=1e-5)
+    np.testing.assert_allclose(theirs[made.triangles[-1, :2]], ours[[two, one]], atol=1e-5)
+
+
 def test_far_from_the_origin_points_keep_their_place(tmp_path, synthetic):
     scan = synthetic.make_scan(tmp_path / "capture")
     points = (scan.mesh.points + np.float32([1234.567, -987.6, 55.5])).astype(np.float32)

@@ -32,6 +32,7 @@ from usdbrdf.asset.layout import ROLES, Asset, relative_path
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.files.naming import readable_label
+from usdbrdf.geometry.fans import point_of_each_fan
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ObjectLabel, welded
@@ -76,7 +77,8 @@ def components_of(scan: Scan) -> tuple[Component, ...]:
     """The objects that have a face; () where the meshes are an input file's."""
     if scan.usd_geometry:
         return ()
-    # Files split vertices at seams; ours has its normals per corner and needs no copies.
+    # Files split vertices at seams; ours has its normals per corner and needs no copies, but where
+    # faces do not hang together.
     mesh, components = welded(scan.mesh), []
     order = np.argsort(mesh.face_object, kind="stable")
     bounds = np.searchsorted(mesh.face_object[order], np.arange(len(scan.objects) + 1))
@@ -84,7 +86,7 @@ def components_of(scan: Scan) -> tuple[Component, ...]:
         faces = order[bounds[i] : bounds[i + 1]]
         if not len(faces):
             continue
-        used, corners = np.unique(mesh.triangles[faces], return_inverse=True)
+        used, triangles = point_of_each_fan(mesh.triangles[faces])
         points = mesh.points[used].astype(np.float64)
         low, high = points.min(axis=0), points.max(axis=0)
         pivot, up = (low + high) / 2, "XYZ".index(scan.up_axis)
@@ -94,7 +96,7 @@ def components_of(scan: Scan) -> tuple[Component, ...]:
             Component(
                 label=label,
                 points=(points - pivot).astype(np.float32),
-                triangles=corners.reshape(-1, 3).astype(np.int32),
+                triangles=triangles,
                 corner_normals=mesh.corner_normals[faces].astype(np.float32),
                 pivot=pivot,
             )
