@@ -32,6 +32,8 @@ _LOOKING, _DIRECTIONS = 16, 16
 # The second skin lies so far behind the first, as a share of the scene's diagonal: further than
 # rays start above a surface.
 _BEHIND = 4e-5
+# Odd numbers of 64 bits: the sum of three corners times these is hardly ever that of three others.
+_HASH = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
 
 @dataclass(frozen=True)
@@ -276,9 +278,11 @@ def _has_back(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double) -> Boo
     """(N,) of ``faces`` with their ``front`` (N, 3): behind each lies another face where its second
     skin would, or before that."""
     diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-    corner = np.sort(welded_ids(mesh.points)[mesh.triangles], axis=1)
-    _, same, times = np.unique(corner, axis=0, return_inverse=True, return_counts=True)
-    twice = times[same.reshape(-1)][faces] > 1
+    corner = np.sort(welded_ids(mesh.points)[mesh.triangles], axis=1).astype(np.uint64)
+    same = (corner * _HASH).sum(axis=1)
+    every = np.sort(same)
+    times = np.searchsorted(every, same[faces], "right") - np.searchsorted(every, same[faces])
+    twice = times > 1
     centre = mesh.points.astype(np.float64)[mesh.triangles[faces]].mean(axis=1)
     origin = (centre - 2 * _BEHIND * diagonal * front).astype(np.float32)
     hits = rays.closest(origin, np.ascontiguousarray(front, np.float32))
