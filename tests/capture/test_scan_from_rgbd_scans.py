@@ -424,3 +424,13 @@ def test_what_others_made_of_a_scan_comes_first(tmp_path):
     _write_record3d(tmp_path, truth())
     (tmp_path / "transforms.json").write_text("{}")
     assert choose_adapter(tmp_path).name == "transforms"
+
+
+def test_objects_beside_a_trajectory_are_read(tmp_path):
+    room = truth()
+    _write_log(tmp_path, room)
+    objects = {"objects": [{"id": 0, "name": "the whole room"}]}
+    (tmp_path / "objects.json").write_text(json.dumps(objects))
+    ids = np.zeros(len(room.triangles), np.int32)
+    write_ply(tmp_path / "mesh.ply", room.points, room.triangles, object_id=ids)
+    assert [one.label for one in read_scan(tmp_path, OPTIONS).objects] == ["the whole room"]

@@ -69,7 +69,6 @@ class _Program(NamedTuple):
 
 _ANEW = "Reconstruct the same photographs with COLMAP, and name its folder"
 _BY_HAND = "Write a transforms.json of the pictures' poses and lens"
-_EXAMPLE = "the example of an adapter, plugins/example_adapter of our sources"
 _AS_USD = "Export cameras and meshes as USD, and convert that"
 _NOTHING = rb"(?!)"
 

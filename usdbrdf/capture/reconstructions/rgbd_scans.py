@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import Pictures, pictures_of
+from usdbrdf.capture.mesh_frames import path_in_capture
 from usdbrdf.capture.reconstructions.shots import (
     Shot,
     ShotCamera,
@@ -60,7 +62,7 @@ _POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")
 _LENS = ("fx", "fy", "cx", "cy")
 # What Open3D takes where nobody says a lens, of PrimeSense's cameras (PinholeCameraIntrinsic.cpp).
 _PUBLISHED = (640, 480), (525.0, 525.0, 319.5, 239.5)
-_TRAJECTORY = "trajectory"
+_TRAJECTORY, _OBJECTS = "trajectory", "objects.json"
 _SCREEN = "ScreenCamera", "ScreenCapture"  # what its viewer calls a camera, and its picture
 _MATTERPORT = "matterport_camera_poses", "matterport_camera_intrinsics"
 _COLOUR_OF_HOUSE, _UNDISTORTED = "matterport_color_images", "undistorted_color_images"
@@ -112,6 +114,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "[capture.format]"
         )
     documents, folder = found.documents(path), _home(path)
+    if options.objects is None and (folder / _OBJECTS).is_file():
+        options = replace(options, objects=path_in_capture(folder, _OBJECTS, options))
     pictures = pictures_of(folder, options, *found.pictures)
     if not pictures.paths and (folder / _VIDEO).is_file():
         raise InputRefused(
@@ -144,7 +148,7 @@ def beside(path: Path) -> list[Path]:
     pictures = (
         file for name in (_COLOUR_OF_HOUSE, _UNDISTORTED) for file in (home / name).glob("*")
     )
-    return [*files, *pictures, *_named_or_in(home, *_LENS_FILES)]
+    return [*files, *pictures, *_named_or_in(home, *_LENS_FILES, _OBJECTS)]
 
 
 def _home(path: Path) -> Path:
