@@ -33,7 +33,7 @@ from usdbrdf.errors import InputRefused
     "name",
     [
         lambda i: f"{i}_rgb.jpg",
-        lambda i: f"{1305031102 + i // 3}.{175304 + 9 * (i % 3)}.jpg",
+        lambda i: f"{1305031102 + i}.{(175304 + 333333 * i) % 1000000:06d}.jpg",
         lambda i: f"{1305031102 + i // 3}.{'123'[i % 3]}{'5' * (i % 3 == 0)}.jpg",
         lambda i: f"a{i + 1} of 12/c1.jpg",
     ],
