@@ -78,6 +78,20 @@ def test_theirs_is_found_and_used(announce, tmp_path):
     assert [a.name for a in list_adapters(plugins=False)] == list(adapters.MODULES)
 
 
+def test_theirs_come_before_those_of_ours_that_claim_much(announce, tmp_path):
+    """A trajectory, or one USD stage, says little of whose format a folder is."""
+    announce(theirs=_THEIRS)
+    trajectory = '{"class_name": "PinholeCameraTrajectory"}'
+    for name, said in (("a.json", trajectory), ("room.usda", "#usda 1.0"), ("a.abc", "Ogawa")):
+        for folder in (tmp_path / name / "theirs", tmp_path / name / "ours"):
+            folder.mkdir(parents=True)
+            (folder / name).write_text(said)
+            chosen = choose_adapter(folder).name
+            assert (chosen == "theirs") == (folder.name == "theirs")
+        (folder.parent / "theirs/transforms.json").write_text("{}")
+        assert choose_adapter(folder.parent / "theirs").name == "transforms"
+
+
 @pytest.mark.fault("S6")
 @pytest.mark.parametrize(
     ("source", "problem"),

@@ -166,11 +166,12 @@ def test_pictures_of_telephones_that_are_not_read_say_how_to_convert_them(made, 
         _read(made, assume_srgb=True)
 
 
-def test_a_folder_of_such_alone_says_so_too(tmp_path):
+@pytest.mark.parametrize("name", ["IMG_1.HEIC", "IMG_1.avif"])
+def test_a_folder_of_such_alone_says_so_too(tmp_path, name):
     (tmp_path / "images").mkdir()
-    (tmp_path / "images/IMG_1.HEIC").write_bytes(HEIC)
+    (tmp_path / "images" / name).write_bytes(HEIC)
     pictures = pictures_of(tmp_path, IngestOptions())
-    with pytest.raises(InputRefused, match=r"IMG_1\.HEIC is HEIC or AVIF.*\[capture\.frames\]$"):
+    with pytest.raises(InputRefused, match=rf"{name} is HEIC or AVIF.*\[capture\.frames\]$"):
         named_pictures.refuse_without_pictures(pictures, tmp_path / "cameras.xml")
 
 
@@ -537,7 +538,7 @@ def test_a_folder_of_masks_by_another_name_is_told(made, name):
         _write_bytes(made.folder / name / f"{i:04d}.png", np.zeros((24, 32, 1), np.uint8))
     said = [sentence for sentence in _read(made).warnings if "[capture.mask]" in sentence]
     assert len(said) == 1
-    assert f"there is a folder {name}, but it is not called masks" in said[0]
+    assert f"there is a folder {name}, but it is not called masks: rename it. [" in said[0]
 
 
 @pytest.mark.parametrize("name", ["label", "face_segment"])

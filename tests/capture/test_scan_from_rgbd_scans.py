@@ -106,6 +106,8 @@ def test_record3d_pictures_may_be_thinned_out_and_are_counted_from_0(tmp_path):
         ({"poses": []}, "no list of poses, as of what was recorded without LiDAR"),
         ({"w": HEIGHT, "h": WIDTH}, "32 x 24 pixels, but the intrinsics are for 24 x 32"),
         ({"poses": [[0, 0, 0, 0, 1, 2, 3]] * 10}, "it has no pose"),
+        ({"poses": [[0, 0, 0, 0.9, 1, 2, 3]] * 10}, "it has no pose"),
+        ({"poses": [[1e308, 1e308, 0, 1, 1, 2, 3]] * 10}, "it has no pose"),
         ({"K": [1, 2], "perFrameIntrinsicCoeffs": []}, "it has no camera"),
     ],
 )
@@ -183,9 +185,12 @@ def test_frames_of_a_video_that_were_thinned_out_keep_their_numbers(tmp_path, st
 @pytest.mark.parametrize(
     ("start", "kept", "said"),
     [
-        (0, range(4), r"10 poses, but 4 pictures that are counted one by one from 0"),
-        (1, range(4), r"10 poses, but 4 pictures that are counted one by one from 1"),
+        (0, range(4), r"10 poses for 4 pictures numbered 0 to 3, as of a video"),
+        (1, range(4), r"10 poses for 4 pictures numbered 1 to 4, as of a video"),
         (7, range(6), r"10 poses for 6 pictures numbered 7 to 12, so nobody knows"),
+        (0, (0, 1, 2, 4), r"10 poses for 4 pictures numbered 0 to 4, as of a video"),
+        (1, range(9), r"10 poses for 9 pictures numbered 1 to 9, .*Extract all again from 0 on"),
+        (1, (0, 1, 2, 4, 5, 6, 7, 8), r"numbered 1 to 9, and nobody knows whether they are"),
     ],
 )
 def test_frames_of_which_nobody_knows_the_pose_are_refused(tmp_path, start, kept, said):
@@ -305,14 +310,6 @@ def test_cameras_of_open3ds_viewer_are_the_room(tmp_path):
     _mesh(tmp_path / "room.ply", room)
     assert choose_adapter(tmp_path).name == "rgbd-scan"
     assert_same(read_scan(tmp_path, OPTIONS), room)
-
-
-def test_a_log_without_a_lens_has_the_one_that_open3d_takes(tmp_path):
-    _write_log(tmp_path, truth())
-    (tmp_path / "intrinsic.json").unlink()
-    scan = read_scan(tmp_path, OPTIONS)
-    assert any("no intrinsic.json beside it" in said for said in scan.warnings)
-    np.testing.assert_allclose(scan.frames.intrinsics[0], np.array([525, 525, 320, 240]) / 20)
 
 
 @pytest.mark.parametrize(

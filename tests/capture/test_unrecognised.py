@@ -119,7 +119,7 @@ def test_cameras_of_other_programs_are_named_with_their_way_in(
     (tmp_path / "images/0001.jpg").write_bytes(b"")
     for path in (document, tmp_path):
         said = _refused(path)
-        assert f"{name} holds the cameras of {program}, which are not read." in said
+        assert f"{name} holds the cameras of {program}, which are not read as they lie." in said
         assert how in said
 
 

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from usdbrdf.options import CaptureOptions
 
 
-# In the order in which they are asked: those whose folders hold other formats too come first.
+# In the order in which they are asked: those whose folders hold other formats too come first, those
+# of which some file lies in many folders last, after other packages' too.
 MODULES = {
     "eyeful-tower": "usdbrdf.capture.formats.eyeful_tower",
     "scannetpp": "usdbrdf.capture.formats.scannetpp",
@@ -85,6 +86,7 @@ DESCRIPTIONS = {
     "alembic": "Alembic cameras: not read, says how to convert them",
 }
 
+_LAST = ("rgbd-scan", "usd", "alembic")
 
 GROUP = "usdbrdf.adapters"
 # Folders in a folder that are asked, where it is no capture itself.
@@ -160,6 +162,7 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
     """The named adapter, or the first that recognises the capture."""
     adapters = list_adapters(plugins=plugins)
     sound = [adapter for adapter in adapters if adapter.module is not None]
+    sound.sort(key=lambda adapter: adapter.name in _LAST)
     if name is not None:
         for adapter in adapters:
             if adapter.name == name:

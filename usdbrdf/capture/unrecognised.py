@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
+
+from usdbrdf.errors import InputRefused
 
 # As in ``named_pictures`` and ``mesh_files``, which load NumPy; a glance needs names alone.
 _PICTURES = frozenset((".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg"))
@@ -69,7 +72,6 @@ class _Program(NamedTuple):
 
 _ANEW = "Reconstruct the same photographs with COLMAP, and name its folder"
 _BY_HAND = "Write a transforms.json of the pictures' poses and lens"
-_EXAMPLE = "the example of an adapter, plugins/example_adapter of our sources"
 _AS_USD = "Export cameras and meshes as USD, and convert that"
 _NOTHING = rb"(?!)"
 
@@ -109,6 +111,10 @@ _PROGRAMS = (
         "Record3D", (".r3d",), (), rb'"poses"',
         "Unzip the .r3d, which is a ZIP file, and name the folder that has metadata and rgbd/",
         "metadata",
+    ),
+    _Program(
+        "Open3D", (), (), rb'"PinholeCameraParameters"',
+        "Put the picture of each beside it, of its name or called ScreenCapture for ScreenCamera",
     ),
     _Program(
         "ScanNet", (".sens",), (), _NOTHING,
@@ -217,7 +223,7 @@ _PROGRAMS = (
     ),
     _Program(
         "Project Aria", (".vrs", "closed_loop_trajectory.csv"), (), _NOTHING,
-        f"{_BY_HAND} (projectaria_tools exports both), and name a mesh in it",
+        f"{_BY_HAND} (projectaria_tools has both), and name a mesh",
     ),
     _Program("EuRoC", (), (), rb"\A#timestamp.*p_RS_R_x", f"{_BY_HAND}, and fuse a mesh (Open3D)"),
     _Program(
@@ -268,6 +274,20 @@ _PROGRAMS = (
 )  # fmt: skip
 
 
+def of_record3d(metadata: Path) -> bool:
+    """Whether a file of this name is Record3D's: others call theirs so too, and its keys have no
+    order."""
+    from usdbrdf.files.documents import read_text
+    from usdbrdf.files.tables import beginning_of
+
+    if beginning_of(metadata).lstrip()[:1] != b"{":
+        return False
+    with suppress(InputRefused):
+        said = read_text(metadata)
+        return '"poses"' in said and ('"K"' in said or '"perFrameIntrinsicCoeffs"' in said)
+    return False
+
+
 def other_program(document: Path) -> str:
     """Whose cameras a file holds that are not read, and how to have them read, or that it has not
     been fetched; else ""."""
@@ -279,7 +299,8 @@ def other_program(document: Path) -> str:
     head = beginning_of(document, _HEAD)
     for one in _PROGRAMS:
         if one.owns(document, head):
-            return f"{document.name} holds the cameras of {one.name}, which are not read. {one.how}"
+            said = f"holds the cameras of {one.name}, which are not read as they lie"
+            return f"{document.name} {said}. {one.how}"
     return ""
 
 

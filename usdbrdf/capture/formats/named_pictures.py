@@ -34,7 +34,7 @@ from usdbrdf.untrusted.mesh_files import FileMesh
 # In the order in which they are taken where one name has several: radiance first.
 SUFFIXES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
 # What cameras write and nothing here reads: documents name it, and what was made of it is there.
-_HEIF = frozenset((".heic", ".heif", ".hif"))
+_HEIF = frozenset((".heic", ".heif", ".hif", ".avif"))
 _OF_CAMERAS = RAW_SUFFIXES | _HEIF
 # Poses are found of these, and radiance beside them is taken instead; PNG has depths more often.
 _PHOTOGRAPHS, _RADIANCE = frozenset((".jpg", ".jpeg")) | _OF_CAMERAS, (".exr", ".hdr")
@@ -425,10 +425,11 @@ def scan_of(
             "[capture.mask]"
         )
     elif unused := folder_of_masks(folder):
-        called = "none of its pictures" if unused == "masks" else "it is not called masks, or none"
+        no_frames = "none of its pictures is called as one of the frames, or named by it"
+        why = no_frames if unused == "masks" else "it is not called masks: rename it"
         findings.warn(
-            f"{source.name}: nothing is masked: there is a folder {unused}, but {called} is called "
-            "as one of the frames, or named by it. [capture.mask]"
+            f"{source.name}: nothing is masked: there is a folder {unused}, but {why}. "
+            "[capture.mask]"
         )
     encoding = options.encoding or encoding
     photographs = refuse_photographs(

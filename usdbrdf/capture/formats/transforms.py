@@ -35,7 +35,7 @@ from usdbrdf.capture.mesh_frames import mesh_beside, scene_above
 from usdbrdf.capture.nerfstudio_lens import focal_of_angle, lens_of_frame, with_skew
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.rigid_poses import is_camera_matrix
-from usdbrdf.capture.unrecognised import other_program
+from usdbrdf.capture.unrecognised import of_record3d, other_program
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.colour import kind_of_encoding, known_encodings
@@ -67,7 +67,8 @@ def matches(path: Path) -> bool:
     """A folder with transforms.json, or such a document itself."""
     document = _document(path)
     is_json = document.suffix == ".json" and document.is_file()
-    return is_json and b'"PinholeCamera' not in beginning_of(document)  # Open3D's
+    others = document.name == "metadata.json" and of_record3d(document)
+    return is_json and not others and b'"PinholeCamera' not in beginning_of(document)  # Open3D's
 
 
 def is_surely(path: Path) -> bool:

@@ -14,8 +14,10 @@ Matterport3D  matterport_camera_poses: world from camera, OpenCV's axes; of undi
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +26,8 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.conventions import opengl_from_opencv
-from usdbrdf.capture.formats.named_pictures import Pictures, pictures_of
+from usdbrdf.capture.formats.named_pictures import SUFFIXES, Pictures, pictures_of
+from usdbrdf.capture.mesh_frames import path_in_capture
 from usdbrdf.capture.reconstructions.shots import (
     Shot,
     ShotCamera,
@@ -41,15 +44,25 @@ from usdbrdf.capture.reconstructions.trajectories import (
     poses_of,
     shots_of_numbers,
 )
-from usdbrdf.capture.unrecognised import OF_MATTERPORT, OPEN3D_LOG, STRAY_TABLE
-from usdbrdf.errors import InputRefused
+from usdbrdf.capture.unrecognised import OF_MATTERPORT, OPEN3D_LOG, STRAY_TABLE, of_record3d
+from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.documents import read_json, read_text
+from usdbrdf.files.images import image_size
 from usdbrdf.files.paths import seen_of
-from usdbrdf.files.tables import beginning_of, csv_rows, number_rows, numbers_among, only_one
+from usdbrdf.files.tables import (
+    beginning_of,
+    csv_rows,
+    files_of,
+    number_in,
+    number_rows,
+    numbers_among,
+    only_one,
+)
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens
 from usdbrdf.options import CaptureOptions
+from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
 
 NAME = "rgbd-scan"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -60,13 +73,14 @@ _POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")
 _LENS = ("fx", "fy", "cx", "cy")
 # What Open3D takes where nobody says a lens, of PrimeSense's cameras (PinholeCameraIntrinsic.cpp).
 _PUBLISHED = (640, 480), (525.0, 525.0, 319.5, 239.5)
-_TRAJECTORY = "trajectory"
+_TRAJECTORY, _OBJECTS = "trajectory", "objects.json"
 _SCREEN = "ScreenCamera", "ScreenCapture"  # what its viewer calls a camera, and its picture
 _MATTERPORT = "matterport_camera_poses", "matterport_camera_intrinsics"
 _COLOUR_OF_HOUSE, _UNDISTORTED = "matterport_color_images", "undistorted_color_images"
 _COLOUR = ("color", "rgb", "image", "images", "")  # Open3D's
 # Where documents may lie in a capture, and the lens of a log.
 _DOCUMENTS = ("scene", "undistorted_camera_parameters")
+_LOGS = ("*.log", "*.txt")
 _LENS_FILES = ("*.json", "*/*intrinsic*.json")
 _OF_SCENES = ("mesh.*", "scene/integrated.ply")
 _OF_HOUSES = ("mesh.*", "matterport_mesh/*/*.obj", "poisson_meshes/*.ply")
@@ -112,6 +126,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             "[capture.format]"
         )
     documents, folder = found.documents(path), _home(path)
+    if options.objects is None and (folder / _OBJECTS).is_file():
+        options = replace(options, objects=path_in_capture(folder, _OBJECTS, options))
     pictures = pictures_of(folder, options, *found.pictures)
     if not pictures.paths and (folder / _VIDEO).is_file():
         raise InputRefused(
@@ -144,16 +160,17 @@ def beside(path: Path) -> list[Path]:
     pictures = (
         file for name in (_COLOUR_OF_HOUSE, _UNDISTORTED) for file in (home / name).glob("*")
     )
-    return [*files, *pictures, *_named_or_in(home, *_LENS_FILES)]
+    return [*files, *pictures, *_named_or_in(home, *_LENS_FILES, _OBJECTS)]
 
 
 def _home(path: Path) -> Path:
     """The capture's folder: that above the one of a document, which has the pictures."""
     folder = capture_folder_of(path)
-    above = any(
-        (folder.parent / name).is_dir() for name in (*_COLOUR[:-1], _COLOUR_OF_HOUSE, _UNDISTORTED)
+    own, above = (
+        any((home / name).is_dir() for name in (*_COLOUR[:-1], _COLOUR_OF_HOUSE, _UNDISTORTED))
+        for home in (folder, folder.parent)
     )
-    return folder.parent if folder.name in _DOCUMENTS and above else folder
+    return folder.parent if folder.name in _DOCUMENTS and above and not own else folder
 
 
 def _named_or_in(path: Path, *patterns: str) -> list[Path]:
@@ -165,16 +182,13 @@ def _named_or_in(path: Path, *patterns: str) -> list[Path]:
 
 
 def _metadata(path: Path) -> list[Path]:
-    """Record3D's: others call files so too, and its keys have no order."""
+    """Record3D's: others call files so too."""
     found = _named_or_in(path, *_RECORD3D)
     return [
         file
-        for file in found[:1]
-        if any((file.parent / name).is_dir() for name in _OF_TELEPHONES[:2])
-        and beginning_of(file).lstrip()[:1] == b"{"
-        and '"poses"' in (said := read_text(file))
-        and ('"K"' in said or '"perFrameIntrinsicCoeffs"' in said)
-    ]
+        for file in found
+        if any((file.parent / name).is_dir() for name in _OF_TELEPHONES[:2]) and of_record3d(file)
+    ][:1]
 
 
 def _of_record3d(
@@ -216,7 +230,7 @@ def _of_stray_scanner(
     documents: Sequence[Path], folder: Path, pictures: Pictures, findings: Findings
 ) -> list[Shot]:
     source = documents[0]
-    rows = csv_rows(source, _POSE)
+    rows, frames = _by_frame(csv_rows(source, _POSE))
     # Newer versions say the lens of each frame; the matrix is that of the last.
     found = [numbers_among([row.get(key) for key in _LENS], 4) for row in rows]
     lenses = [None if lens is None else (*lens.tolist(),) for lens in found]
@@ -231,27 +245,55 @@ def _of_stray_scanner(
         lenses = [lens]
     poses = poses_of(numbers_among([row.get(key) for key in _POSE], 7) for row in rows)
     cameras = [None if lens is None else UnsizedCamera(intrinsics=lens) for lens in lenses]
-    return shots_of_numbers(
-        counted_pictures(pictures, len(poses), source, findings), poses, cameras, pictures
-    )
+    counted = counted_pictures(pictures, frames, source, findings)
+    return shots_of_numbers(counted, poses, cameras, pictures)
+
+
+def _by_frame(
+    rows: Sequence[Mapping[str, str]],
+) -> tuple[Sequence[Mapping[str, str]], Sequence[int]]:
+    """The rows in the order of their frames, with these; counted where they are no such numbers."""
+    stated = [number_in(row, "frame") for row in rows]
+    whole = [int(number) for number in stated if number is not None and number >= 0]
+    if len(set(whole)) < len(rows) or whole != stated:
+        return rows, range(len(rows))
+    order = sorted(range(len(rows)), key=whole.__getitem__)
+    return [rows[i] for i in order], [whole[i] for i in order]
 
 
 def _of_open3d(path: Path) -> list[Path]:
     """A trajectory, one called so before others, JSON before a log, which has no lens; else the
-    files of single cameras."""
-    found = _named_or_in(path, "*.json", "*.log", "scene/*.log", "scene/*.json")
+    files of single cameras that have their pictures. Not where a USD stage may have the cameras:
+    one that is not called as a mesh."""
+    stages = files_of(path, USD_SUFFIXES) if path.is_dir() else []
+    if len(stages) == 1 and stages[0].stem.lower() != "mesh":
+        return []
+    found = _named_or_in(path, "*.json", *_LOGS, *(f"scene/{log}" for log in _LOGS), "scene/*.json")
     heads = {file: beginning_of(file) for file in found}
     whole = [f for f in found if b'"PinholeCameraTrajectory"' in heads[f]] or [
-        f for f in found if f.suffix == ".log" and re.match(OPEN3D_LOG, heads[f])
+        f for f in found if f.suffix != ".json" and re.match(OPEN3D_LOG, heads[f])
     ]
     named = [file for file in whole if file.stem == _TRAJECTORY]
-    return named[:1] or whole or [f for f in found if b'"PinholeCameraParameters"' in heads[f]]
+    single = (f for f in found if b'"PinholeCameraParameters"' in heads[f])
+    return named[:1] or whole or [file for file in single if _has_picture(file)]
+
+
+def _has_picture(document: Path) -> bool:
+    """Whether a picture is called as a single camera is, beside it or in a folder of pictures."""
+    name = document.stem.replace(*_SCREEN)
+    places = (document.parent / folder for folder in _COLOUR)
+    return any(
+        os.path.isfile(place / f"{name}{as_written(suffix)}")
+        for place in places
+        for suffix in SUFFIXES
+        for as_written in (str.lower, str.upper)
+    )
 
 
 def _of_trajectory(
     documents: Sequence[Path], folder: Path, pictures: Pictures, findings: Findings
 ) -> list[Shot]:
-    is_log = documents[0].suffix == ".log"
+    is_log = documents[0].suffix != ".json"
     read = [] if is_log else [_object(read_json(file)) for file in documents]
     if not is_log and not any("parameters" in document for document in read):
         return [
@@ -266,13 +308,12 @@ def _of_trajectory(
     source = only_one(documents, folder, "trajectories of Open3D", how)
     cameras: list[ShotCamera | None]
     if is_log:
-        poses, cameras = _of_log(source), [_lens_beside(source, folder, findings)]
+        poses, cameras = _of_log(source), [_lens_beside(source, folder, pictures, findings)]
     else:
         rows = rows_of(read[0], "parameters")
         poses, cameras = [_from_world(row) for row in rows], [_stated(row) for row in rows]
-    return shots_of_numbers(
-        counted_pictures(pictures, len(poses), source, findings), poses, cameras, pictures
-    )
+    counted = counted_pictures(pictures, range(len(poses)), source, findings)
+    return shots_of_numbers(counted, poses, cameras, pictures)
 
 
 def _object(document: Any) -> dict[str, Any]:
@@ -304,14 +345,19 @@ def _stated(row: Mapping[str, Any]) -> ShotCamera | None:
     return None if lens is None else ShotCamera(resolution=size_in(inner), intrinsics=lens)
 
 
-def _lens_beside(source: Path, folder: Path, findings: Findings) -> ShotCamera | None:
-    """The lens of a log, in a JSON beside it; InputRefused where there is none, or several."""
+def _lens_beside(
+    source: Path, folder: Path, pictures: Pictures, findings: Findings
+) -> ShotCamera | None:
+    """The lens of a log, in a JSON beside it, one that is called so before others; InputRefused
+    where there is none, or several."""
     places = (*_named_or_in(folder, *_LENS_FILES), *source.parent.glob("*.json"))
     found: dict[ShotCamera, Path] = {}
-    for file in places:
-        if b'"intrinsic_matrix"' in beginning_of(file) and (
-            lens := _stated(_object(read_json(file)))
-        ):
+    for file in sorted(places, key=lambda file: "intrinsic" not in file.name.lower()):
+        if found and "intrinsic" not in file.name.lower():
+            break
+        head = beginning_of(file)
+        is_lens = b'"intrinsic_matrix"' in head and b'"PinholeCameraParameters"' not in head
+        if is_lens and (lens := _stated(_object(read_json(file)))):
             found.setdefault(lens, file)
     if len(found) > 1:
         one, other = [file.name for file in found.values()][:2]
@@ -322,12 +368,25 @@ def _lens_beside(source: Path, folder: Path, findings: Findings) -> ShotCamera |
     if found:
         return next(iter(found))
     (width, height), (fx, fy, cx, cy) = _PUBLISHED
+    if not all(_is_of_size(picture, width, height) for picture in pictures.paths):
+        raise InputRefused(
+            f"{source}: no JSON beside it states the lens of the pictures. Write intrinsic.json: "
+            '{"width": W, "height": H, "intrinsic_matrix": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}, in '
+            "pixels. [capture.camera]"
+        )
     findings.warn(
         f"{source.name}: no intrinsic.json beside it says a lens, so it is the one that Open3D "
         f"takes then, a focal length of {fx:g} for {width} x {height} pixels. Bring the file if "
         "the camera was another. [capture.camera]"
     )
     return ShotCamera(resolution=(width, height), intrinsics=(fx, fy, cx + 0.5, cy + 0.5))
+
+
+def _is_of_size(picture: Path, width: int, height: int) -> bool:
+    try:
+        return image_size(picture)[:2] == (width, height)
+    except ImageRefused:  # of which the frames tell
+        return True
 
 
 def _of_matterport(path: Path) -> list[Path]:
@@ -385,9 +444,9 @@ def _of_configuration(
     camera, shots = None, []
     for line in read_text(documents[0]).splitlines():
         command, *words = line.split() or [""]
-        if command == "intrinsics_matrix" and (lens := pinhole_of(words)):
-            fx, fy, cx, cy = lens
-            camera = UnsizedCamera(intrinsics=(fx, fy, cx + 0.5, cy + 0.5), from_bottom=True)
+        if command == "intrinsics_matrix":
+            lens = pinhole_of(words, 0.5)
+            camera = None if lens is None else UnsizedCamera(intrinsics=lens, from_bottom=True)
         elif command == "scan" and len(words) > 2:
             numbers = numbers_among(words[2:], 16)
             pose = None if numbers is None else opengl_from_opencv(numbers.reshape(4, 4))

@@ -206,7 +206,9 @@ def scan_of_shots(
             try:
                 camera = camera.of_size(*image_size(image)[:2])
             except ImageRefused as error:
-                findings.drop(shot.name, clause_of(error, image), "capture.image")
+                is_other = str(error).endswith("[capture.size]")
+                rule = "capture.size" if is_other else "capture.image"
+                findings.drop(shot.name, clause_of(error, image), rule)
                 continue
         mask = None
         if shot.mask:

@@ -3,7 +3,9 @@ same number or not, and pinholes as matrices."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,10 @@ from usdbrdf.model.arrays import Double
 # Pictures that may be lacking at the end of all that are counted one by one, as those that an
 # encoder loses, in parts of the poses.
 _LOST = 0.01
+# And where some were deleted, so that it is not so plain how they were counted.
+_DELETED = 0.1
+_OFF_LENGTH = 0.01  # of a quaternion from 1, as few digits leave it
+_NUMBER = re.compile(r"(\d{6,}\.\d+|\d+)")  # of names: seconds with a fraction, else whole
 
 
 def pinhole_of(matrix: object, centre: float = 0.0) -> tuple[float, float, float, float] | None:
@@ -42,47 +48,87 @@ def poses_of(rows: Iterable[Double | None]) -> list[Double | None]:
     None of what is none."""
     return [
         rigid_pose(Rotation.from_quat(row[:4]).as_matrix(), row[4:])
-        if row is not None and np.linalg.norm(row[:4]) > 0.5
+        if row is not None and _is_turn(row[:4])
         else None
         for row in rows
     ]
 
 
+def _is_turn(quaternion: Double) -> bool:
+    # Of larger numbers the length may be none.
+    return bool(np.abs(quaternion).max() < 2 and abs(np.linalg.norm(quaternion) - 1) < _OFF_LENGTH)
+
+
 def counted_pictures(
-    pictures: Pictures, count: int, source: Path, findings: Findings
+    pictures: Pictures, numbers: Sequence[int], source: Path, findings: Findings
 ) -> list[tuple[int, Path]]:
-    """The pictures of so many poses, each with the number of its own: as many in their order, of
-    fewer by the number at the end of their names, from 0 or 1 on. InputRefused where nobody knows
-    whose they are."""
-    numbered = pictures.numbered()
-    if not pictures.paths or len(numbered) == count:
-        return list(enumerate(numbered.values()))
-    if len(pictures.paths) == count:
-        return list(enumerate(pictures.paths))
+    """The pictures of poses that have these numbers, in their order, each with the place of its own
+    pose, one behind the last where it has none. As many pictures as poses, or as their numbers
+    count, are theirs one by one; fewer are those of the numbers at the end of their names.
+    InputRefused where nobody knows whose they are."""
+    each, count = pictures.of_each_name(), max(numbers, default=-1) + 1
+    if len(each) in (0, len(numbers), count):
+        in_order = sorted(each, key=lambda path: _natural(path.relative_to(pictures.folder)))
+        numbered = dict(enumerate(in_order))
+    else:
+        numbered = _from_0(pictures, len(each), numbers, source, findings)
+    if len(each) == len(numbers):
+        return [*numbered.items()]
+    place = {number: i for i, number in enumerate(numbers)}
+    return [(place.get(number, len(numbers)), picture) for number, picture in numbered.items()]
+
+
+def _natural(path: Path) -> list[str | Decimal]:
+    """In whose order 2 comes before 10, and a time before one of more seconds."""
+    parts = _NUMBER.split(path.with_suffix("").as_posix())
+    return [Decimal(part) if i % 2 else part for i, part in enumerate(parts)]
+
+
+def _from_0(
+    pictures: Pictures, num_pictures: int, numbers: Sequence[int], source: Path, findings: Findings
+) -> dict[int, Path]:
+    """Pictures by the numbers at the end of their names, counted from 0 as those of the poses."""
+    numbered, count = pictures.numbered(), max(numbers, default=-1) + 1
     first, last = min(numbered, default=-1), max(numbered, default=count)
     start = int(first > 0 and last == count)
-    whole = last - first + 1 == len(numbered) and first <= 1
-    if last - start >= count:
-        called = f"numbered {first} to {last}" if numbered else "without numbers in their names"
-        raise InputRefused(
-            f"{source}: {count} poses for {len(pictures.paths)} pictures {called}, so nobody knows "
-            "which is whose. Bring all pictures of this trajectory, and no others. "
-            "[capture.frames]"
+    called = f"numbered {first} to {last}" if numbered else "without numbers in their names"
+    is_whole = last - first + 1 == len(numbered)
+    is_dense = first <= 1 and 2 * len(numbered) > last - first + 2
+    some = _LOST if is_whole else _DELETED
+    said = ""
+    if len({tuple(re.findall(r"\d+", p.stem)[:-1]) for p in numbered.values()}) > 1:
+        said = (
+            "whose names have several numbers, as of times, so nobody knows which is whose. Bring "
+            "a picture of every pose, and no others"
         )
-    if whole and last - start < (1 - _LOST) * count - 1:
-        raise InputRefused(
-            f"{source}: {count} poses, but {len(numbered)} pictures that are counted one by one "
-            f"from {first}, as of a video of which every so many were extracted, so nobody knows "
-            "which pose is whose. Extract all, and delete those that are not needed. "
-            "[capture.frames]"
+    elif len(numbered) == count:
+        return dict(enumerate(numbered.values()))
+    elif last - start >= count:
+        said = (
+            f"{called}, so nobody knows which is whose. Bring all pictures of this trajectory, and "
+            "no others"
         )
-    if first > 0 and not start:
+    elif is_dense and last - start < (1 - some) * count - 1:
+        said = (
+            f"{called}, as of a video of which every so many were extracted, so nobody knows which "
+            "pose is whose. Extract all, and delete those that are not needed, but not the last"
+        )
+    elif is_dense and first == 1 and not start and 0 in numbers:
+        said = (
+            f"{called}, and nobody knows whether they are counted from 0 as the poses are, or from "
+            "1. Extract all again from 0 on, and delete those that are not needed"
+        )
+    if said:
+        raise InputRefused(
+            f"{source}: {len(numbers)} poses for {num_pictures} pictures {said}. [capture.frames]"
+        )
+    if first > 0 and not start and 0 in numbers:
         findings.warn(
-            f"{source.name}: {len(numbered)} pictures for {count} poses, numbered {first} to "
-            f"{last}, are taken to be counted from 0, as the poses are. If they were counted from "
-            "1, extract them again. [capture.frames]"
+            f"{source.name}: {len(numbered)} pictures for {len(numbers)} poses, numbered {first} "
+            f"to {last}, are taken to be counted from 0, as the poses are. If they were counted "
+            "from 1, extract them again. [capture.frames]"
         )
-    return [(number - start, picture) for number, picture in numbered.items()]
+    return {number - start: picture for number, picture in numbered.items()}
 
 
 def shots_of_numbers(
