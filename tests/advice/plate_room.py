@@ -44,6 +44,11 @@ def quads():
         ("east", (x, 0, 0), (0, 0, z), (0, y, 0)),
         ("plate", (PLATE_X, PLATE_Y[0], PLATE_Z[0]), (0, 0.8, 0), (0, 0, 1.4)),
         ("plate", (PLATE_X - 0.02, PLATE_Y[0], PLATE_Z[0]), (0, 0, 1.4), (0, 0.8, 0)),
+        # Closed: what shines on the front does not shine between the two.
+        ("plate", (PLATE_X - 0.02, PLATE_Y[0], PLATE_Z[0]), (0.02, 0, 0), (0, 0, 1.4)),
+        ("plate", (PLATE_X - 0.02, PLATE_Y[1], PLATE_Z[0]), (0, 0, 1.4), (0.02, 0, 0)),
+        ("plate", (PLATE_X - 0.02, PLATE_Y[0], PLATE_Z[0]), (0, 0.8, 0), (0.02, 0, 0)),
+        ("plate", (PLATE_X - 0.02, PLATE_Y[0], PLATE_Z[1]), (0.02, 0, 0), (0, 0.8, 0)),
         ("lamp", (LAMP_X[0], LAMP_Y, LAMP_Z[0]), (0.8, 0, 0), (0, 0, 0.8)),
         ("cabinet", (lx, ly, hz), (a, 0, 0), (0, b, 0)),
         ("cabinet", (lx, ly, lz), (0, b, 0), (a, 0, 0)),
