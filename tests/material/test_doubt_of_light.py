@@ -14,6 +14,18 @@ from usdbrdf.transport.brdf import CONDUCTOR, DIELECTRIC
 TEXELS, VIEWS, PSI, OFF = 40, 8, 0.5, 0.3
 
 
+def _samples(radiance: np.ndarray, rng: np.random.Generator) -> ViewSamples:
+    count = TEXELS * VIEWS
+    return ViewSamples(
+        texel=np.repeat(np.arange(TEXELS), VIEWS),
+        frame=np.tile(np.arange(VIEWS), TEXELS),
+        position=rng.uniform(0, 1, (count, 3)).astype(np.float32),
+        radiance=radiance.astype(np.float32),
+        noise=np.full((count, 3), 1e-3, np.float32),
+        cell=0.1,
+    )
+
+
 @pytest.mark.parametrize("mirrored_by", ["none", "one ray", "all"])
 def test_psi_is_doubted_as_far_as_doubted_light_tells_it(mirrored_by: str):
     """A lamp that one ray finds, and the frame does not show, tells nothing of psi."""
@@ -27,14 +39,7 @@ def test_psi_is_doubted_as_far_as_doubted_light_tells_it(mirrored_by: str):
         doubt[11] = OFF * slope[11]
     elif mirrored_by == "all":
         doubt = np.float32(OFF) * slope
-    samples = ViewSamples(
-        texel=np.repeat(np.arange(TEXELS), VIEWS),
-        frame=np.tile(np.arange(VIEWS), TEXELS),
-        position=rng.uniform(0, 1, (count, 3)).astype(np.float32),
-        radiance=radiance.astype(np.float32),
-        noise=np.full((count, 3), 1e-3, np.float32),
-        cell=0.1,
-    )
+    samples = _samples(radiance, rng)
 
     def lobe(kind: int, phi: float, seed: int, of_doubt: bool = False):
         noise = np.random.default_rng(seed).normal(1, 0.02, slope.shape).astype(np.float32)
@@ -55,14 +60,7 @@ def test_a_coloured_metal_is_doubted_as_what_it_mirrors_is_weighed():
     slope[:, 0] *= np.where(rng.random((count, 1)) < 0.5, 20, 1)
     doubt = np.where(slope > 2.0, np.float32(OFF) * slope, np.float32(0))
     radiance = (PSI * tint * slope)[..., 0] * (1 + rng.normal(0, 0.01, (count, 1)))
-    samples = ViewSamples(
-        texel=np.repeat(np.arange(TEXELS), VIEWS),
-        frame=np.tile(np.arange(VIEWS), TEXELS),
-        position=rng.uniform(0, 1, (count, 3)).astype(np.float32),
-        radiance=radiance.astype(np.float32),
-        noise=np.full((count, 3), 1e-3, np.float32),
-        cell=0.1,
-    )
+    samples = _samples(radiance, rng)
 
     def lobe(kind: int, phi: float, seed: int, of_doubt: bool = False):
         return np.zeros_like(slope), (doubt if of_doubt else slope)

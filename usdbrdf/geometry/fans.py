@@ -7,6 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from usdbrdf.model.arrays import Int
+from usdbrdf.model.mesh import edges_of_two
 
 
 def point_of_each_fan(triangles: Int) -> tuple[Int, Int]:
@@ -16,16 +17,11 @@ def point_of_each_fan(triangles: Int) -> tuple[Int, Int]:
     directions. Applications that keep a mesh by its points, as Blender does, have one normal for
     the corners there, which of several fans is that of any: of a wall, that of the floor.
     """
-    start, end = triangles.reshape(-1).astype(np.int64), np.roll(triangles, -1, axis=1).reshape(-1)
+    start = triangles.reshape(-1)
     corner = np.arange(len(start), dtype=np.int32).reshape(-1, 3)
     following = np.roll(corner, -1, axis=1).reshape(-1)
-    span = int(triangles.max(initial=0)) + 1
-    edge = np.minimum(start, end) * span + np.maximum(start, end)
-    order = np.argsort(edge, kind="stable")
-    first = np.flatnonzero(np.diff(edge[order], prepend=-1))
-    pair = first[np.diff(first, append=len(order)) == 2]
-    one, other = order[pair], order[pair + 1]
-    opposite = start[one] == end[other]
+    one, other = edges_of_two(triangles)
+    opposite = start[one] == start[following[other]]
     one, other = one[opposite], other[opposite]
     # The corner where an edge starts is that where the other face's edge ends.
     here = np.concatenate([one, following[one]])

@@ -7,7 +7,7 @@ together with it; and, where no frame looked, on which side the surfaces lie tha
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,13 @@ from usdbrdf.geometry.visible_faces import visible_faces
 from usdbrdf.kernel import kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
-from usdbrdf.model.mesh import ScanMesh, doubled_areas, face_normals_and_angles, welded_ids
+from usdbrdf.model.mesh import (
+    ScanMesh,
+    doubled_areas,
+    edges_of_two,
+    face_normals_and_angles,
+    welded_ids,
+)
 from usdbrdf.transport.rays import RayScene, lift_from_surface
 
 # Rays that graze a face may belong to its neighbour behind the edge: their side tells nothing.
@@ -61,12 +67,14 @@ class Sides:
     """turned, both (F,) bool: the winding shows the wrong side; frames see either side.
 
     frames  (F, 2) int32: how many of them see the front, which the winding tells, and the back
+    part  (F,): the number of what hangs together with it, see ``connected_windings``
     faces_room  (F,) bool: the back, which no frame sees, faces what they see all the same
     """
 
     turned: Bool
     both: Bool
     frames: Int
+    part: Long
     faces_room: Bool
 
     @property
@@ -92,7 +100,9 @@ def sides_from_cameras(mesh: ScanMesh, rays: RayScene, cameras: Iterable[Camera]
             lost, _looking_around(mesh, rays, normals, lost, shown, part, agrees), facing
         )
     nothing = np.zeros(len(facing), np.bool_)
-    return Sides(turned=facing < 0, both=seen.both, frames=seen.frames, faces_room=nothing)
+    return Sides(
+        turned=facing < 0, both=seen.both, frames=seen.frames, part=part, faces_room=nothing
+    )
 
 
 def with_backs(sides: Sides, mesh: ScanMesh, rays: RayScene, *, referenced: bool) -> Sides:
@@ -106,7 +116,7 @@ def with_backs(sides: Sides, mesh: ScanMesh, rays: RayScene, *, referenced: bool
     if referenced:
         nothing = np.zeros_like(sides.both)
         return replace(sides, both=nothing, faces_room=nothing)
-    part, _ = connected_windings(mesh)
+    part = sides.part
     seen = np.bincount(part, sides.frames.any(axis=1)) > 0
     some = _some_of_each_part(part, doubled_areas(mesh.points, mesh.triangles))
     some = some[seen[part[some]]]
@@ -172,16 +182,10 @@ def connected_windings(mesh: ScanMesh) -> tuple[Long, Bool]:
     Gives the part of each face, (F,) numbered from 0, and whether the face is wound as the part's
     first one is, (F,): a part is wound alike once those that do not agree are turned.
     """
-    corners = welded_ids(mesh.points)[mesh.triangles].astype(np.int64)
-    start, end = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
-    face = np.repeat(np.arange(len(corners)), 3)
-    key = np.stack([mesh.face_object[face], np.minimum(start, end), np.maximum(start, end)])
-    order = np.lexsort(key)
-    same = (np.diff(key[:, order], axis=1) == 0).all(axis=0)
-    first = np.flatnonzero(np.concatenate([[True], ~same]))
-    pairs = first[np.diff(first, append=len(order)) == 2]
-    one, other = order[pairs], order[pairs + 1]
-    root, agrees = _united(face[one], face[other], start[one] != start[other], len(corners))
+    corners = welded_ids(mesh.points)[mesh.triangles]
+    start = corners.reshape(-1)
+    one, other = edges_of_two(corners, mesh.face_object)
+    root, agrees = _united(one // 3, other // 3, start[one] != start[other], len(corners))
     return np.unique(root, return_inverse=True)[1].reshape(-1), agrees
 
 
@@ -224,27 +228,32 @@ def _looking_around(
     """(F,) of the parts that no frame shows (lost, (F,)): which side sees more of what frames show,
     which is of each face its front (shown 1), its back (-1) or neither (0)."""
     unseen = np.flatnonzero(lost)
-    corner = mesh.points.astype(np.float64)[mesh.triangles[unseen]]
     area = doubled_areas(mesh.points, mesh.triangles[unseen])
     order = np.lexsort((-area, part[unseen]))
     place = np.arange(len(order)) - np.searchsorted(part[unseen][order], part[unseen][order])
-    chosen = order[place < _LOOKING]
-    face, centre = unseen[chosen], corner[chosen].mean(axis=1)
+    face = unseen[order[place < _LOOKING]]
     side = np.where(agrees[face], 1.0, -1.0)[:, None] * normals[face]
     balance = np.zeros(len(face))
-    diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-    for direction in _even_directions(_DIRECTIONS):
-        for sign in (1.0, -1.0):
-            # From the front of a face, then from its back.
-            out = sign * side
-            way = direction * np.where((out @ direction)[:, None] < 0, -1.0, 1.0)
-            origin = lift_from_surface(centre.astype(np.float32), out.astype(np.float32), diagonal)
-            hit = rays.closest(origin, np.ascontiguousarray(way, np.float32)).face
+    for sign in (1.0, -1.0):
+        # From the front of a face, then from its back.
+        for way, hit in _around(mesh, rays, face, sign * side):
             sees = (hit >= 0) & ((way * normals[hit]).sum(axis=1) * shown[hit] < 0)
             balance += sign * sees
     of_part = np.bincount(part[face], balance, minlength=part.max() + 1)
     # Where that tells nothing either, the winding stays.
     return np.where(of_part[part] == 0, 1, np.where(agrees, 1, -1) * of_part[part]).astype(np.int64)
+
+
+def _around(
+    mesh: ScanMesh, rays: RayScene, faces: Long, side: Double
+) -> Iterator[tuple[Double, Int]]:
+    """From the middles of ``faces`` (N,) on a ``side`` (N, 3), of unit length, one direction of
+    each after the other, (N, 3), and which face lies there, (N,), -1 for none."""
+    centre = mesh.points.astype(np.float64)[mesh.triangles[faces]].mean(axis=1).astype(np.float32)
+    origin = lift_from_surface(centre, side.astype(np.float32), mesh.diagonal)
+    for direction in _even_directions(_DIRECTIONS):
+        way = direction * np.where((side @ direction)[:, None] < 0, -1.0, 1.0)
+        yield way, rays.closest(origin, np.ascontiguousarray(way, np.float32)).face
 
 
 def _some_of_each_part(part: Long, area: Double) -> Long:
@@ -262,13 +271,8 @@ def _some_of_each_part(part: Long, area: Double) -> Long:
 def _share_behind(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double, both: Bool) -> Double:
     """(N,) of ``faces``: of what lies around the back of each, what shows its ``front`` (F, 3) or
     has ``both`` (F,)."""
-    diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-    centre = mesh.points.astype(np.float64)[mesh.triangles[faces]].mean(axis=1)
-    out, share = -front[faces], np.zeros(len(faces))
-    origin = lift_from_surface(centre.astype(np.float32), out.astype(np.float32), diagonal)
-    for direction in _even_directions(_DIRECTIONS):
-        way = direction * np.where((out @ direction)[:, None] < 0, -1.0, 1.0)
-        hit = rays.closest(origin, np.ascontiguousarray(way, np.float32)).face
+    share = np.zeros(len(faces))
+    for way, hit in _around(mesh, rays, faces, -front[faces]):
         shows = ((way * front[hit]).sum(axis=1) < 0) | both[hit]
         share += (hit >= 0) & shows
     return share / _DIRECTIONS
@@ -277,16 +281,15 @@ def _share_behind(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double, bo
 def _has_back(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double) -> Bool:
     """(N,) of ``faces`` with their ``front`` (N, 3): behind each lies another face where its second
     skin would, or before that."""
-    diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
     corner = np.sort(welded_ids(mesh.points)[mesh.triangles], axis=1).astype(np.uint64)
     same = (corner * _HASH).sum(axis=1)
     every = np.sort(same)
     times = np.searchsorted(every, same[faces], "right") - np.searchsorted(every, same[faces])
     twice = times > 1
     centre = mesh.points.astype(np.float64)[mesh.triangles[faces]].mean(axis=1)
-    origin = (centre - 2 * _BEHIND * diagonal * front).astype(np.float32)
+    origin = (centre - 2 * _BEHIND * mesh.diagonal * front).astype(np.float32)
     hits = rays.closest(origin, np.ascontiguousarray(front, np.float32))
-    other = (hits.face >= 0) & (hits.face != faces) & (hits.distance < 2 * _BEHIND * diagonal)
+    other = (hits.face >= 0) & (hits.face != faces) & (hits.distance < 2 * _BEHIND * mesh.diagonal)
     return np.asarray(twice | other, np.bool_)
 
 
@@ -323,8 +326,7 @@ def _with_second_skin(mesh: ScanMesh, skins: Bool) -> ScanMesh:
     """The faces ``skins`` (F,) once more, seen from behind and a little behind themselves."""
     corner = mesh.points[mesh.triangles[skins]]
     normal = face_normals_and_angles(mesh.points, mesh.triangles[skins])[0]
-    diagonal = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-    behind = corner - (_BEHIND * diagonal) * normal[:, None].astype(np.float32)
+    behind = corner - (_BEHIND * mesh.diagonal) * normal[:, None].astype(np.float32)
     number = len(mesh.points) + np.arange(3 * len(corner), dtype=np.int32).reshape(-1, 3)
     return replace(
         mesh,

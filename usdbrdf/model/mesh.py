@@ -59,6 +59,11 @@ class ScanMesh:
         """(F, 3) of unit length, as the faces are wound; zeros without area."""
         return face_normals_and_angles(self.points, self.triangles)[0]
 
+    @cached_property
+    def diagonal(self) -> float:
+        """Of the box around all points, in their unit."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
 
 @dataclass(frozen=True, kw_only=True)
 class ScanGeometry:
@@ -217,6 +222,21 @@ def is_closed(triangles: Int) -> bool:
     span = int(triangles.max(initial=0)) + 1
     there, back = np.sort(start * span + end), np.sort(end * span + start)
     return bool(np.array_equal(there, back) and (np.diff(there) > 0).all())
+
+
+def edges_of_two(triangles: Int, owner: Int | None = None) -> tuple[Long, Long]:
+    """Edges that exactly two triangles (F, 3), without copies of points, share, of one ``owner``
+    (F,) if these are given: the corner of either, (N,) counted through all triangles, from which
+    the edge runs to its triangle's next corner."""
+    start, end = triangles.reshape(-1).astype(np.int64), np.roll(triangles, -1, axis=1).reshape(-1)
+    span = int(triangles.max(initial=0)) + 1
+    edge = np.maximum(start, end) * span + np.minimum(start, end)
+    of_corner = np.zeros_like(edge) if owner is None else np.repeat(owner, 3)
+    order = np.lexsort((of_corner, edge))
+    differs = (np.diff(edge[order]) != 0) | (np.diff(of_corner[order]) != 0)
+    first = np.flatnonzero(np.concatenate([[True], differs]))
+    pairs = first[np.diff(first, append=len(order)) == 2]
+    return order[pairs], order[pairs + 1]
 
 
 _AT_A_TIME = 1 << 18  # triangles
