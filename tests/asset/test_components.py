@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 
+from tests.validation.faults import edited
 from usdbrdf.asset.header import Provenance, new_layer, refuse_old_layout
 from usdbrdf.asset.layers.interface import components_of, write_interface
 from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import ROLES
-from usdbrdf.asset.readers.compose import open_measured, open_weaker
+from usdbrdf.asset.readers.compose import open_edited, open_measured, open_weaker
 from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
-from usdbrdf.errors import OwnershipConflict
+from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.model.mesh import ObjectLabel
+from usdbrdf.tasks.task import Task
 from usdbrdf.validation.validate import validate
 
 IDENTIFIERS = ("Stuhl_No_1", "wall", "lamp")
@@ -284,3 +286,43 @@ def test_an_asset_of_the_layout_without_components_is_left_alone(built):
     old.Export(str(built.asset.root_layer))
     with pytest.raises(OwnershipConflict, match=r"new folder.+edits\.usda.+\[ownership\.layout\]"):
         refuse_old_layout(built.asset)
+
+
+@pytest.mark.parametrize("role", ["root", "scan", "material"])
+def test_an_asset_of_a_newer_version_is_not_read_as_if_it_were_ours(built, role):
+    """Validate says it, too: usdbrdf.SchemaVersion."""
+    open_edited(built.asset)
+    layer = built.asset.root_layer if role == "root" else built.asset.layer(role)
+    with edited(layer) as opened:
+        about = opened.customLayerData
+        about["usdbrdf"]["schemaVersion"] = 7
+        opened.customLayerData = about
+    readers = [open_edited] if role == "root" else [open_edited, open_measured]
+    for read in readers:
+        with pytest.raises(InputRefused, match=rf"{layer.name}: .+newer.+7.+\[asset\.newer\]"):
+            read(built.asset)
+
+
+def test_a_step_does_not_go_on_in_an_asset_of_a_newer_version(built):
+    with edited(built.asset.root_layer) as opened:
+        about = opened.customLayerData
+        about["usdbrdf"]["schemaVersion"] = 7
+        opened.customLayerData = about
+    task = Task(asset=built.asset, name="fit", role="material", parameters={}, inputs={})
+    with pytest.raises(InputRefused, match=r"\[asset\.newer\]"):
+        task.run(lambda run: {})
+
+
+def test_who_renames_in_the_edits_is_told_where_that_goes(built):
+    """The interface of a step stands in the same layer stack, where USD allows no relocates."""
+    with edited(built.asset.edits_layer) as layer:
+        layer.relocates = [("/room/geo/lamp", "/room/geo/lantern")]
+    with pytest.raises(InputRefused, match=r"Relocates .+ in a layer that references the asset"):
+        open_edited(built.asset)
+    shot = Usd.Stage.CreateInMemory()
+    with edited(built.asset.edits_layer) as layer:
+        layer.relocates = []
+    shot.DefinePrim("/set").GetReferences().AddReference(str(built.asset.root_layer))
+    shot.GetRootLayer().relocates = [("/set/geo/lamp", "/set/geo/lantern")]
+    assert shot.GetPrimAtPath("/set/geo/lantern/lamp").IsA(UsdGeom.Mesh)
+    assert not shot.GetCompositionErrors()

@@ -6,7 +6,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from usdbrdf.files.images import open_image, read_exr
+from usdbrdf.files.images import open_image, read_exr, write_exr
 from usdbrdf.files.published_images import copy_without_metadata, write_texture
 
 SECRETS = {
@@ -103,6 +103,16 @@ def test_a_texture_keeps_floats_and_all_channels(tmp_path):
     assert np.array_equal(read_exr(target), pixels)
     write_texture(target, target)
     assert np.array_equal(read_exr(target), pixels)
+
+
+def test_a_texture_is_written_into_a_folder_whose_name_is_a_pattern(tmp_path):
+    """OpenImageIO replaces every % of the path that it stages a texture at."""
+    folder, pixels = tmp_path / "50%" / "%04d" / "a", np.full((2, 3, 3), 0.5, np.float32)
+    folder.mkdir(parents=True)
+    write_exr(tmp_path / "a.exr", pixels)
+    write_texture(folder / "b.exr", tmp_path / "a.exr")
+    assert np.array_equal(read_exr(folder / "b.exr"), pixels)
+    assert [file.name for file in folder.iterdir()] == ["b.exr"]
 
 
 @pytest.mark.parametrize("name", [b"ow\xf2er", b"ow(er", b"o.n[r"])

@@ -2,12 +2,23 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pxr import Sdf, Usd
 
-from tests.validation.faults import CHAIR, COLOUR_TEXTURE, FAULTS, SURFACE, Types, edited, opinion
+from tests.validation.faults import (
+    CHAIR,
+    COLOUR_TEXTURE,
+    FAULTS,
+    SURFACE,
+    Types,
+    edited,
+    opinion,
+    said_in_a_review,
+    seen_of_chair,
+)
 from usdbrdf.files.images import write_exr
 from usdbrdf.validation.rule import AssetStage, Severity
 from usdbrdf.validation.validate import RULES, own_findings, validate
@@ -95,6 +106,17 @@ def test_objects_that_an_artist_sets_aside_are_not_lost(built, prim, aside):
     with edited(built.asset.edits_layer) as layer:
         Sdf.CreatePrimInLayer(layer, prim).SetInfo(aside, aside != "active")
     assert own(built) == []
+
+
+@pytest.mark.parametrize("prim", [Path(CHAIR).parent.as_posix(), CHAIR])
+def test_an_object_that_was_judged_may_be_set_aside(built, prim):
+    said_in_a_review(built, verdict="reject", comment="too green", **seen_of_chair(built))
+    with edited(built.asset.edits_layer) as layer:
+        Sdf.CreatePrimInLayer(layer, prim).SetInfo("active", False)
+    assert own(built) == []
+    said_in_a_review(built, verdict="perhaps")
+    (finding,) = own(built)
+    assert finding.rule == "usdbrdf.ReviewRecord"
 
 
 def test_a_part_of_an_asset_has_lost_nothing(built):

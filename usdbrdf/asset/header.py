@@ -15,7 +15,7 @@ from pxr import Sdf, UsdGeom, Vt
 from usdbrdf.asset.layout import Asset, open_metadata, record_of
 from usdbrdf.asset.properties import SCHEMA_VERSION
 from usdbrdf.asset.schemas import verify
-from usdbrdf.errors import OwnershipConflict
+from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.model.capture import Scan
 
 TIME_CODES_PER_SECOND = 24.0
@@ -103,6 +103,19 @@ def refuse_old_layout(asset: Asset) -> None:
             "the mesh </NAME/geo/chair> as </NAME/geo/chair/chair> and the material "
             "</NAME/mtl/chair> as </NAME/geo/chair/mtl/chair>. [ownership.layout]"
         )
+
+
+def refuse_newer(*layers: Path) -> None:
+    """InputRefused where one of the tool's layers states schemas that this version does not know:
+    what it calls by the same name may be something else, and would be taken for what we know."""
+    for layer in layers:
+        known = read_provenance(layer).get("schemaVersion", 1)
+        if isinstance(known, int) and known > SCHEMA_VERSION:
+            raise InputRefused(
+                f"{layer}: written by a newer usdbrdf (schema version {known}, this one knows "
+                f"{SCHEMA_VERSION}). Install that version, or convert the capture into a new "
+                "folder. [asset.newer]"
+            )
 
 
 def _stored(value: Any) -> Any:

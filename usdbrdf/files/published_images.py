@@ -7,8 +7,11 @@ Pixels stay what they are, to the bit: each file is read back and compared.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +74,10 @@ def write_texture(
     ):
         wanted.attribute(name, value)
     with temporary_beside(target) as staged:
-        kind = oiio.MakeTxTexture
-        if not oiio.ImageBufAlgo.make_texture(kind, image, str(staged), wanted):
+        with _without_percent(staged.parent) as folder:
+            place = str(folder / staged.name)
+            made = oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, image, place, wanted)
+        if not made:
             raise EnvironmentFailure(
                 f"{target}: cannot be written ({oiio.geterror()}). Free disk space or correct the "
                 "permission, then run the same command again. [image.write]"
@@ -81,6 +86,20 @@ def write_texture(
         stored = pixels.astype(np.float16) if str(spec.format) == "half" else pixels
         refuse_other(target, staged, stored.astype(np.float32))
         publish(staged, target)
+
+
+@contextmanager
+def _without_percent(folder: Path) -> Iterator[Path]:
+    """Another path to a folder whose own has a %: OpenImageIO names what it stages beside a texture
+    by random digits, which it puts in the place of every % of the whole path."""
+    if "%" not in str(folder):
+        yield folder
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        yield Path(f"/proc/self/fd/{descriptor}")
+    finally:
+        os.close(descriptor)
 
 
 def misnamed(path: Path) -> str:

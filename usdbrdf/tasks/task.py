@@ -6,7 +6,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from usdbrdf.asset.header import Draft, Provenance, StageHeader, read_header, refuse_old_layout
+from usdbrdf.asset.header import (
+    Draft,
+    Provenance,
+    StageHeader,
+    read_header,
+    refuse_newer,
+    refuse_old_layout,
+)
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.readers.compose import refuse_missing
 from usdbrdf.job.progress import say, warn
@@ -59,8 +66,10 @@ class Task:
 
     def run(self, work: Callable[[TaskRun], dict[str, Any]], workers: Workers = HERE) -> TaskResult:
         """Do the work unless it is done already (see ``usdbrdf.job.task``); OwnershipConflict in an
-        asset of an old layout, InputRefused in one that has lost a layer."""
+        asset of an old layout, InputRefused in one that has lost a layer, or is of a newer one."""
         refuse_old_layout(self.asset)
+        # Layers of the steps are made anew; the root layer is written once.
+        refuse_newer(self.asset.root_layer)
         order = 1 + ROLES.index(self.role)
         if order > 1:
             refuse_missing(self.asset, order)

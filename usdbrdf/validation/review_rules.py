@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from pxr import Sdf
+
 from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.asset.review import Judgement, followed, read_review, review_file
 from usdbrdf.errors import InputRefused
@@ -34,10 +36,18 @@ def review_record(scene: AssetStage) -> Iterator[Fault]:
         return
     known = {str(prim.GetPath()): prim for prim in scene.objects}
     for path, judgement in said.items():
-        if path not in known:
+        if path not in known and not _is_measured(scene, path):
             yield Fault(scene.asset_root, f"{file.name} judges <{path}>, which is no object.")
         elif judgement.fault:
-            yield Fault(known[path], f"in {file.name} {judgement.fault}")
+            yield Fault(
+                known.get(path, scene.asset_root), f"in {file.name} of <{path}> {judgement.fault}"
+            )
+
+
+def _is_measured(scene: AssetStage, path: str) -> bool:
+    """Whether it is an object to the layers of the steps: an artist may set any of them aside."""
+    label = Sdf.Path(path).AppendProperty("usdBrdf:label")
+    return any(layer.GetAttributeAtPath(label) for layer in scene.own_layers)
 
 
 @rule(Severity.INFO)

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 from pxr import Sdf, Tf, Usd, UsdUtils
 
-from usdbrdf.asset.header import Provenance, new_layer, read_header, read_provenance
+from usdbrdf.asset.header import Provenance, new_layer, read_header, read_provenance, refuse_newer
 from usdbrdf.asset.layout import LIGHTING, ROLES, Asset, open_metadata
 from usdbrdf.asset.manifest import refuse_converted
 from usdbrdf.asset.maps import AssetMaps
@@ -41,6 +41,8 @@ _PASSED_OVER = re.compile(
     r"(?:of layer|for \w+ introduced by) @(?P<by>[^@]*)@(?:<[^>]*>)?"
     r"(?: -- (?P<why>.*?))?(?:[\s;]*skipping)?"
 )
+# What USD says of relocates in the layer stack that has the prim which they move.
+_RELOCATED = "invalid opinion at the relocation source path"
 # How USD's parser calls its own rules.
 _OF_PARSER = re.compile(r"\bpxrInternal\w+::(\w+::)*")
 
@@ -66,7 +68,10 @@ def open_measured(asset: Asset) -> Usd.Stage:
     """All layers that the tool wrote, without the artist's, in the asset's lighting."""
     refuse_converted(asset)
     common = replace(asset, lighting="")
-    return _in_lighting(_sublayered(common, [common.layer(role) for role in ROLES]), asset)
+    layers = [common.layer(role) for role in ROLES]
+    stage = _sublayered(common, layers)
+    refuse_newer(*layers)
+    return _in_lighting(stage, asset)
 
 
 def open_edited(asset: Asset) -> Usd.Stage:
@@ -76,6 +81,7 @@ def open_edited(asset: Asset) -> Usd.Stage:
     beside = [file for file in [asset.photographs_layer] if file.is_file()]
     try_in_child(asset.root_layer, beside=beside)
     stage = open_stage(asset.root_layer)
+    refuse_newer(asset.root_layer, *map(asset.layer, ROLES))
     for file in beside:
         open_metadata(file)  # which names it
         stage.GetSessionLayer().subLayerPaths.append(str(file))
@@ -187,6 +193,12 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
             cure = (
                 "That is an address: run usdbrdf where the resolver that knows it is set up "
                 "(PXR_PLUGINPATH_NAME), or name a file."
+            )
+        if _RELOCATED in problems[0]:
+            cure = (
+                "Relocates rename what a layer has by reference, and an asset's own layers stand "
+                "beside its edits.usda: take them out there, and rename in a layer that references "
+                "the asset."
             )
         raise InputRefused(
             f"{subject}: the stage does not compose: {problems[0]}. {cure} [stage.open]"
