@@ -370,9 +370,9 @@ def scan_from_parts(
     findings.refuse_too_few_frames(source, total, views=len(frames))
     geometry = read_geometry()
     findings.geometry = geometry
-    if not any(r.lens.curve == "equirectangular" for r in rigid):
-        refuse_without_parallax(frames, geometry.mesh, source)
     rays = RayScene(geometry.mesh.points, geometry.mesh.triangles)
+    if not any(r.lens.curve == "equirectangular" for r in rigid):
+        refuse_without_parallax(frames, rays, source)
     hit_share = refuse_rays_that_miss(frames, rays, source)
     usable = check_frames(
         photographs,
