@@ -23,6 +23,8 @@ _MOST = calibration.number("astray.most")
 # Points that a frame shares with two others, without which it is not judged.
 _FEWEST = 50
 _LISTED, _SEED = 6, 0
+# Steps in which the frames' exposures are found.
+_STEPS = 5
 
 
 def frames_astray(logarithm: Float) -> Bool:
@@ -40,7 +42,13 @@ def frames_astray(logarithm: Float) -> Bool:
         return astray
     known = known[rows]
     value = np.where(known, logarithm[rows], np.nan).astype(np.float64)
-    usual = np.nanmedian(value, axis=1)
+    # What frames are brighter or darker by would pass for a difference between points.
+    gain, usual = np.zeros(len(astray)), np.nanmedian(value, axis=1)
+    seen = known.any(axis=0)
+    for _ in range(_STEPS):
+        gain[seen] = np.nanmedian((value - usual[:, None])[:, seen], axis=0)
+        usual = np.nanmedian(value - gain, axis=1)
+    value = value - gain
     # Of n samples the median is near each of them by itself, by about (n - 1) / n.
     number = known.sum(axis=1)
     off = (value - usual[:, None]) * np.sqrt(number / (number - 1))[:, None]
@@ -57,7 +65,7 @@ def frames_astray(logarithm: Float) -> Bool:
 
 
 def _scatter(off: Double) -> float:
-    """Mean distance from the middle, which is the frame's exposure."""
+    """Mean distance from the middle."""
     return float(np.abs(off - np.median(off)).mean())
 
 
