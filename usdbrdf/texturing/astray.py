@@ -15,6 +15,7 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Bool, Double, Float
+from usdbrdf.texturing.exposures import gains_of_frames
 
 _LEAST = calibration.number("astray.least")
 _UNRELATED = calibration.number("astray.unrelated")
@@ -23,8 +24,6 @@ _MOST = calibration.number("astray.most")
 # Points that a frame shares with two others, without which it is not judged.
 _FEWEST = 50
 _LISTED, _SEED = 6, 0
-# Steps in which the frames' exposures are found.
-_STEPS = 5
 
 
 def frames_astray(logarithm: Float) -> Bool:
@@ -43,12 +42,8 @@ def frames_astray(logarithm: Float) -> Bool:
     known = known[rows]
     value = np.where(known, logarithm[rows], np.nan).astype(np.float64)
     # What frames are brighter or darker by would pass for a difference between points.
-    gain, usual = np.zeros(len(astray)), np.nanmedian(value, axis=1)
-    seen = known.any(axis=0)
-    for _ in range(_STEPS):
-        gain[seen] = np.nanmedian((value - usual[:, None])[:, seen], axis=0)
-        usual = np.nanmedian(value - gain, axis=1)
-    value = value - gain
+    value = value - gains_of_frames(logarithm[rows]).logarithm
+    usual = np.nanmedian(value, axis=1)
     # Of n samples the median is near each of them by itself, by about (n - 1) / n.
     number = known.sum(axis=1)
     off = (value - usual[:, None]) * np.sqrt(number / (number - 1))[:, None]
