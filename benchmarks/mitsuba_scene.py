@@ -94,6 +94,10 @@ def mend(folder: Path, parent: ET.Element, child: ET.Element) -> None:
         if turned is None:
             turned = ET.SubElement(child, "transform", name="toWorld")
         turned.insert(0, ET.Element("rotate", x="1", angle="-90"))
+        for scale in child.findall("float[@name='scale']"):  # of 0.6, for both
+            scale.set("name", "sky_scale")
+            if kind == "sunsky":
+                ET.SubElement(child, "float", name="sun_scale", value=scale.get("value", "1"))
     if child.tag == "bsdf" and child.get("type") in SOLID and parent.tag in ("scene", "shape"):
         inner = ET.Element("bsdf", type=child.get("type", ""))
         inner.extend(list(child))

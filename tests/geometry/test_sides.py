@@ -187,20 +187,22 @@ def test_what_hangs_together_has_a_back_as_a_whole_or_none(noise: float):
     assert sofa.mean() in (0, 1)
 
 
+@pytest.mark.parametrize("larger", [0.0, 0.3])
 @pytest.mark.parametrize("gap", [0.0, 1e-5, 1e-4])
-def test_a_sheet_whose_back_the_file_has_gets_no_other(gap: float):
+def test_a_sheet_whose_back_the_file_has_gets_no_other(gap: float, larger: float):
+    """But one that lies on a larger one, of which frames see the rim, has none."""
     points, triangles, face_object, names = room_mesh()
     sheet = np.float32([[1, 0.4, 1], [3, 0.4, 1], [3, 0.4, 2], [1, 0.4, 2]])
-    behind = sheet - np.float32([0, gap, 0])
+    way = np.float32([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
+    behind = sheet - np.float32([0, gap, 0]) + np.float32(larger) * way
     number = np.int32([[0, 2, 1], [0, 3, 2]])
-    mesh = _mesh(
-        np.concatenate([points, sheet, behind]),
-        np.concatenate([triangles, len(points) + number, len(points) + 4 + number[:, ::-1]]),
-        np.append(face_object, [len(names)] * 4).astype(np.int32),
-    )
+    faces = np.concatenate([triangles, len(points) + number, len(points) + 4 + number[:, ::-1]])
+    owner = np.append(face_object, np.repeat([len(names), len(names) + 1], 2)).astype(np.int32)
+    mesh = _mesh(np.concatenate([points, sheet, behind]), faces, owner)
     places = [(2.0 + 0.1 * k, 2.5, 1.5) for k in range(5)]
     poses = [look_at(np.array(place), np.array([2.0, 0, 1.5])) for place in places]
-    assert not _sides(mesh, _cameras(poses)).skins[-4:].any()
+    skins = _sides(mesh, _cameras(poses)).skins[-4:]
+    assert skins.all() == skins.any() == (larger > 0)
 
 
 def test_normals_turn_with_their_faces_and_missing_ones_are_made(room):

@@ -361,12 +361,14 @@ def test_lamps_are_looked_at_closely_where_they_light_evenly(
     found = looked_at_closely(surface, lit, DARK, frames, asked, lamps, strength, 5)
     assert told["beside"] == (surface, lit, DARK, asked, lamps, 5)
     assert told["even"] == (surface, asked, lamps, strength, 5)
-    its_asked, its_sources, certain = found
+    its_asked, its_sources, certain, start = found
+    np.testing.assert_allclose(start, np.log([[1.0] * 3, [2.0] * 3]))
     texel = FLOOR[:40:2]
     np.testing.assert_array_equal(its_asked.texel, texel)
     np.testing.assert_allclose(its_asked.mirrored, np.pi / 4)
     assert (its_sources, certain is lamps.certain) == ("glossy", True)
-    gloss_asked, sources, through = told["gloss"]
+    gloss_asked, sources, through, also = told["gloss"]
+    assert also is start
     assert gloss_asked is its_asked
     assert sources.share is share
     np.testing.assert_array_equal(through, np.stack([texel, 2 * texel]))
@@ -385,7 +387,7 @@ def test_strengths_are_those_that_explain_most_and_their_errors_the_largest_chan
     solution = Solution(
         np.log([[2.0, 3, 4], [5, 6, 7]]), np.zeros((1, 3)), np.zeros(3), np.zeros((1, 3))
     )
-    monkeypatch.setattr(lamp_light, "solved", lambda *_: solution)
+    monkeypatch.setattr(lamp_light, "likeliest", lambda *_: solution)
     monkeypatch.setattr(lamp_light, "jackknife", lambda *_: np.array([[0.3, 0, 0], [0, 0, 0.5]]))
     monkeypatch.setattr(lamp_light, "pull_of_prior", lambda *_: np.array([[0.4, 0, 0], [0.0] * 3]))
     lamps = _lamps(hall, -1, 0, 1)

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from usdbrdf.shading.outside_light import Asked, Solution, Sources, jackknife, pull_of_prior, solved
+from usdbrdf.shading.outside_light import (
+    Asked,
+    Solution,
+    Sources,
+    jackknife,
+    likeliest,
+    pull_of_prior,
+    solved,
+)
 
 WALLS, EACH = 12, 60
 STRENGTH = np.array([40.0, 15.0])
@@ -111,3 +119,47 @@ def test_what_little_light_of_the_dark_is_not_known_does_not_dim_a_lamp():
 
     assert off(0.04) < 0.1
     assert off(0.0) > 2 * off(0.04)
+
+
+def _spots(strength: float, mean: list[float]) -> tuple[Asked, Sources]:
+    """A lamp that lights a tenth of the texels of twelve walls, of which a fifth are in a shadow
+    of which nobody knows; its strength is thought to be ``mean`` (3,), a logarithm."""
+    random = np.random.default_rng(2)
+    segment = np.repeat(np.arange(WALLS, dtype=np.int32), EACH)
+    share = np.where(random.random(len(segment)) < 0.1, random.uniform(0.01, 0.02, len(segment)), 0)
+    albedo = random.uniform(0.2, 0.7, WALLS)[segment]
+    shines = random.random(len(segment)) < 0.8
+    texture = np.exp(0.1 * random.standard_normal(len(segment)))
+    reflected = albedo * texture * (1 + strength * share * shines)
+    asked = Asked(
+        texel=np.arange(len(segment)),
+        segment=segment,
+        owner=segment,
+        reflected=np.tile(reflected[:, None], 3),
+        clipped=np.zeros(len(segment), np.bool_),
+        irradiance=np.ones((len(segment), 3)),
+        mirrored=np.zeros((len(segment), 3)),
+    )
+    no_pairs = np.zeros((0, 2), np.int64), np.zeros(0)
+    family = np.zeros(1, np.int64)
+    return asked, Sources(share[None], np.array([mean]), np.array([3.0]), family, *no_pairs)
+
+
+def test_a_lamp_is_looked_for_from_what_was_told_of_it_too():
+    asked, sources = _spots(1500.0, [0.0, 0.0, 0.0])
+    # From far away all texels that it lights are outliers.
+    assert (solved(asked, sources).log_radiance[0] < np.log(100)).all()
+    found = likeliest(asked, sources, np.full((1, 3), np.log(400.0)))
+    np.testing.assert_allclose(found.log_radiance[0], np.log(1500), atol=0.05)
+
+
+def test_what_one_channel_misses_the_others_tell():
+    asked, sources = _spots(1500.0, [0.0, 0.0, np.log(1500)])
+    assert (solved(asked, sources).log_radiance[0, :2] < np.log(100)).all()
+    np.testing.assert_allclose(likeliest(asked, sources).log_radiance[0], np.log(1500), atol=0.05)
+
+
+def test_a_start_from_which_less_is_explained_changes_nothing():
+    asked, sources, found = _walls(alone=False)
+    other = likeliest(asked, sources, np.full((2, 3), 30.0))
+    np.testing.assert_allclose(other.log_radiance, found.log_radiance, atol=1e-3)

@@ -122,7 +122,7 @@ def with_backs(sides: Sides, mesh: ScanMesh, rays: RayScene, *, referenced: bool
     some = some[seen[part[some]]]
     front = np.where(sides.turned, -1.0, 1.0)[:, None] * mesh.face_normals
     behind = _share_behind(mesh, rays, some, front, sides.both)
-    alone = ~_has_back(mesh, rays, some, front[some])
+    alone = ~_has_back(mesh, rays, some, front)
     count = int(part.max()) + 1
     share = np.bincount(part[some], behind * alone, count)
     in_room = share > np.bincount(part[some], minlength=count) / 2
@@ -279,18 +279,18 @@ def _share_behind(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double, bo
 
 
 def _has_back(mesh: ScanMesh, rays: RayScene, faces: Long, front: Double) -> Bool:
-    """(N,) of ``faces`` with their ``front`` (N, 3): behind each lies another face where its second
-    skin would, or before that."""
+    """(N,) of ``faces``: where its second skin would lie, or before that, each has another face
+    behind it whose ``front`` (F, 3) looks the other way."""
     corner = np.sort(welded_ids(mesh.points)[mesh.triangles], axis=1).astype(np.uint64)
-    same = (corner * _HASH).sum(axis=1)
-    every = np.sort(same)
-    times = np.searchsorted(every, same[faces], "right") - np.searchsorted(every, same[faces])
-    twice = times > 1
+    same = np.unique((corner * _HASH).sum(axis=1), return_inverse=True)[1].reshape(-1)
+    together = np.stack([np.bincount(same, way) for way in front.T], axis=-1)
+    own = front[faces]
+    twin = (together[same[faces]] * own).sum(axis=1) < np.bincount(same)[same[faces]] - 0.5
     centre = mesh.points.astype(np.float64)[mesh.triangles[faces]].mean(axis=1)
-    origin = (centre - 2 * _BEHIND * mesh.diagonal * front).astype(np.float32)
-    hits = rays.closest(origin, np.ascontiguousarray(front, np.float32))
-    other = (hits.face >= 0) & (hits.face != faces) & (hits.distance < 2 * _BEHIND * mesh.diagonal)
-    return np.asarray(twice | other, np.bool_)
+    origin = (centre - 2 * _BEHIND * mesh.diagonal * own).astype(np.float32)
+    hits = rays.closest(origin, np.ascontiguousarray(own, np.float32))
+    other = (hits.face >= 0) & (hits.distance < 2 * _BEHIND * mesh.diagonal)
+    return np.asarray(twin | (other & ((front[hits.face] * own).sum(axis=1) < 0)), np.bool_)
 
 
 def _even_directions(count: int) -> Double:

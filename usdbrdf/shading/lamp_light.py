@@ -24,8 +24,8 @@ from usdbrdf.shading.outside_light import (
     Sources,
     gloss_of_scene,
     jackknife,
+    likeliest,
     pull_of_prior,
-    solved,
 )
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
@@ -94,7 +94,9 @@ def looked_at_closely(
         for k, light in enumerate(_alone(lamps))
     ]
     sources = sources_of(lamps, share)
-    return strengths(asked, gloss_of_scene(asked, sources, np.stack(sent_on)), lamps.certain)
+    start = np.repeat(np.log(strength)[:, None], 3, axis=1)
+    glossy = gloss_of_scene(asked, sources, np.stack(sent_on), start)
+    return strengths(asked, glossy, lamps.certain, start)
 
 
 def beside_lamps(
@@ -120,9 +122,10 @@ def sources_of(lamps: Lamps, share: Double) -> Sources:
     )
 
 
-def strengths(asked: Asked, sources: Sources, certain: Bool) -> Strengths:
-    """Those that explain best what the texels reflect; ``certain`` (K,) as of ``Lamps``."""
-    found = solved(asked, sources)
+def strengths(asked: Asked, sources: Sources, certain: Bool, *others: Double) -> Strengths:
+    """Those that explain best what the texels reflect; ``certain`` (K,) as of ``Lamps``,
+    ``others`` (K, 3) of ``likeliest``."""
+    found = likeliest(asked, sources, *others)
     error = np.hypot(
         jackknife(asked, sources, found, certain), pull_of_prior(asked, sources, found)
     ).max(axis=1)

@@ -78,6 +78,8 @@ _GIVEN = 0.01
 _OF_SEGMENT = calibration.number("outside.albedo_of_segment")
 _WHITEST, _AS_WHITE = calibration.pair("outside.whitest")
 _ITERATIONS = 40
+# A source so much brighter in one channel than in another, a logarithm, is looked for from each.
+_APART = 1.0
 _LEAST_NOISE = calibration.number("outside.least_noise")
 
 
@@ -100,12 +102,7 @@ def solved(
     asked = Asked._make(values[order] for values in asked)
     sources = sources._replace(share=np.ascontiguousarray(sources.share[:, order]))
     if start is None:
-        light = np.log(asked.irradiance + sources.irradiance(sources.mean))
-        rest = np.log(asked.reflected) - light
-        num = int(asked.segment.max()) + 1
-        albedo = np.stack([np.median(rest[asked.segment == k], axis=0) for k in range(num)])
-        gloss = np.full((num, 3), sources.gloss[0])
-        start = Solution(sources.mean.copy(), albedo, np.full(3, _USUAL_ALBEDO[0]), gloss)
+        start = _begun(asked, sources, sources.mean)
     found = start
     # Which channel it is that clips, what does not clip tells first.
     for counted in (~asked.clipped[:, None] & np.ones(3, np.bool_), None):
@@ -118,6 +115,81 @@ def solved(
         ]
         found = Solution(*(np.stack(parts, axis=-1) for parts in zip(*channels, strict=True)))
     return found
+
+
+def likeliest(asked: Asked, sources: Sources, *others: Double) -> Solution:
+    """As ``solved``, but each channel from several starts, since far from a strength the texels
+    that tell it are outliers: from the prior's means, from ``others`` (K, 3), logarithms of
+    radiance, and from what the other channels told."""
+    found = solved(asked, sources)
+    least = _misfit(asked, sources, found)
+
+    def tried(log_radiance: Double) -> None:
+        nonlocal found, least
+        other = solved(asked, sources, _begun(asked, sources, log_radiance))
+        misfit = _misfit(asked, sources, other)
+        better = misfit < least
+        pairs = zip(other, found, strict=True)
+        found = Solution(*(np.where(better, new, kept) for new, kept in pairs))
+        least = np.where(better, misfit, least)
+
+    for start in others:
+        tried(start)
+    apart = np.ptp(found.log_radiance, axis=1)
+    if (apart > _APART).any():
+        for channel in range(3):
+            tried(np.repeat(found.log_radiance[:, channel : channel + 1], 3, axis=1))
+    return found
+
+
+def _begun(asked: Asked, sources: Sources, log_radiance: Double) -> Solution:
+    """With sources of these strengths (K, 3), from which to go on."""
+    rest = np.log(asked.reflected) - np.log(asked.irradiance + sources.irradiance(log_radiance))
+    count = int(asked.segment.max()) + 1
+    albedo = [medians_of_segments(channel, asked.segment, count) for channel in rest.T]
+    gloss = np.full((count, 3), sources.gloss[0])
+    return Solution(
+        log_radiance.copy(), np.stack(albedo, axis=-1), np.full(3, _USUAL_ALBEDO[0]), gloss
+    )
+
+
+def _misfit(asked: Asked, sources: Sources, found: Solution) -> Double:
+    """(3,) minus the logarithm of the likelihood of what the texels reflect, times what was thought
+    of sources and albedos before the evidence, up to a constant."""
+    of_family = np.bincount(sources.family + 1)[sources.family + 1]
+    weight = sources.deviation**-2.0 / np.where(sources.family < 0, 1, of_family)
+    off = (found.log_radiance - sources.mean) ** 2 * weight[:, None]
+    one, other = sources.pairs.T
+    beside = (found.log_radiance[one] - found.log_radiance[other]) / sources.apart[:, None]
+    albedo = (found.log_albedo - found.mean) / _OF_SEGMENT
+    over = np.maximum(found.log_albedo - np.log(_WHITEST), 0) / _AS_WHITE
+    usual = (found.mean - _USUAL_ALBEDO[0]) / _USUAL_ALBEDO[1]
+    prior = off.sum(0) + (beside**2).sum(0) + (albedo**2 + over**2).sum(0) + usual**2
+    model = _model(asked, sources, found)
+    return np.asarray(0.5 * prior + _unlikely(asked, model, sources.stray))
+
+
+def _model(asked: Asked, sources: Sources, found: Solution) -> Double:
+    """(N, 3) W/m^2: what the texels reflect by what was ``found``."""
+    scattered = asked.irradiance + sources.irradiance(found.log_radiance)
+    model = np.exp(found.log_albedo)[asked.segment] * scattered
+    return np.asarray(model + found.gloss[asked.segment] * asked.mirrored)
+
+
+def _unlikely(asked: Asked, model: Double, stray: float) -> Double:
+    """(3,) minus the logarithm of the likelihood, under Student's t, of what the texels reflect
+    where the ``model`` (N, 3) is that, up to a constant."""
+    number, plain = int(asked.segment.max()) + 1, ~asked.clipped
+    size = np.bincount(asked.segment[plain], minlength=number)
+    counts = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment[plain]]
+    misfit = np.zeros(3)
+    for channel, residual in enumerate(np.log(asked.reflected / model).T):
+        noise = _noise_of_segments(asked, residual, number)[asked.segment]
+        noise = np.hypot(noise, stray * model[:, channel].mean() / model[:, channel])
+        square = (residual / noise)[plain] ** 2
+        each = np.log(noise[plain]) + 0.5 * (_FREEDOM + 1) * np.log1p(square / _FREEDOM)
+        misfit[channel] = counts @ each
+    return misfit
 
 
 def _solved_channel(
@@ -255,31 +327,19 @@ def _add_priors(
     gradient[segment] -= over * _AS_WHITE**-2
 
 
-def gloss_of_scene(asked: Asked, sources: Sources, sent_on: Double) -> Sources:
+def gloss_of_scene(asked: Asked, sources: Sources, sent_on: Double, *others: Double) -> Sources:
     """The sources in a scene as glossy as it is likeliest to be, under Student's t, with all its
     segments about that, give or take as much; and with what surfaces send on of them, ``sent_on``
     (K, N) if all were usual dielectrics. What these send on of the light that was seen is in it:
-    frames saw it mirrored."""
-    number, plain = int(asked.segment.max()) + 1, ~asked.clipped
-    size = np.bincount(asked.segment[plain], minlength=number)
-    counts = np.minimum(1, _INDEPENDENT / np.maximum(size, 1))[asked.segment[plain]]
+    frames saw it mirrored. others (K, 3): as of ``likeliest``."""
 
     def with_gloss(gloss: float) -> Sources:
         return sources._replace(share=sources.share + gloss * sent_on, gloss=(gloss, gloss))
 
     def cost(gloss: float) -> float:
         glossy = with_gloss(gloss)
-        found = solved(asked, glossy)
-        explained = np.exp(found.log_albedo)[asked.segment]
-        explained *= asked.irradiance + glossy.irradiance(found.log_radiance)
-        explained += found.gloss[asked.segment] * asked.mirrored
-        total = 0.0
-        for channel in np.log(asked.reflected / explained).T:
-            noise = _noise_of_segments(asked, channel, number)[asked.segment]
-            square = (channel / noise)[plain] ** 2
-            each = np.log(noise[plain]) + 0.5 * (_FREEDOM + 1) * np.log1p(square / _FREEDOM)
-            total += float(counts @ each)
-        return total
+        found = likeliest(asked, glossy, *others)
+        return float(_unlikely(asked, _model(asked, glossy, found), sources.stray).sum())
 
     return with_gloss(min(_GLOSS, key=cost))
 
