@@ -68,8 +68,12 @@ def test_a_few_are_named_and_many_refused():
     assert said.startswith("transforms.json: 2 of 10 frames that were compared show other things")
     assert "0002.exr, 0007.exr. " in said
     assert list(doubts_about_places(astray & False, names, None)) == []
-    with pytest.raises(InputRefused, match=r"^room: 3 of 10 .* \[capture\.astray\]$"):
-        list(doubts_about_places(astray | (np.arange(10) == 5), names, Path("room")))
+    # Of what was moved or switched between frames as much can be true.
+    assert "poses of other frames, or something was moved, or lamps were switched" in said
+    third = astray | (np.arange(10) == 5)
+    assert len(list(doubts_about_places(third, names, None))) == 1
+    with pytest.raises(InputRefused, match=r"^room: 4 of 10 .* \[capture\.astray\]$"):
+        list(doubts_about_places(third | (np.arange(10) == 6), names, Path("room")))
 
 
 @pytest.mark.fault("C17")

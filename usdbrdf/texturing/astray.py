@@ -1,12 +1,12 @@
-"""Which frames do not belong where their poses say, while the others agree about what is there?
+"""Which frames do not show what the others do where their poses say, while these agree about it?
 
 A frame with the pose of another shows, at every point of the mesh, what has nothing to do with what
-the others show there. Its white balance or its exposure then seem off; its pose is.
+the others show there. Its white balance or its exposure then seem off; its pose is. What was moved,
+or lamps that were switched, between frames can look so too: pixels alone do not tell which it is.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -67,7 +67,8 @@ def _scatter(off: Double) -> float:
 def doubts_about_places(astray: Bool, names: Sequence[str], source: Path | None) -> Iterator[str]:
     """A sentence that names the frames that are ``astray`` of those that were compared.
 
-    Raises InputRefused where these are more than a fifth, in the name of ``source``.
+    Raises InputRefused where these are more than a third, in the name of ``source``: fewer may have
+    looked at something that changed, of which texels' medians make the best.
     """
     off = [name for name, wrong in zip(names, astray.tolist(), strict=True) if wrong]
     if not off:
@@ -77,8 +78,11 @@ def doubts_about_places(astray: Bool, names: Sequence[str], source: Path | None)
         f"{len(off)} of {len(names)} frames that were compared show other things than the rest do "
         f"at the same points of the mesh: {', '.join(off[:_LISTED])}{more}"
     )
-    cure = "Likely they have the poses of other frames. Correct these, or leave the frames out"
-    if len(off) > math.floor(_MOST * len(names)):
+    cure = (
+        "They have the poses of other frames, or something was moved, or lamps were switched, "
+        "between frames. Correct the poses, leave these frames out, or make a capture of each state"
+    )
+    if len(off) > _MOST * len(names):
         where = f"{source}: " if source else ""
         limit = f"(limit {_MOST:.0%} of the frames)"
         raise InputRefused(f"{where}{what} {limit}. {cure}. [capture.astray]")

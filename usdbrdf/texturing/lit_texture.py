@@ -41,7 +41,7 @@ class LitTexture:
     coverage   what is known of each texel
     contradicting  image and gain of the frames that show the same texels brighter or darker than
                    the others do
-    misplaced      a sentence on the frames that have the poses of others, if there are any
+    misplaced      a sentence on the frames that show other things than the rest do
     """
 
     lit: Float
