@@ -36,6 +36,9 @@ def test_frames_that_show_what_others_show_elsewhere_are_found():
     for i in (3, 11):
         shown[:, i] = np.roll(shown[:, i], 200)
     assert np.flatnonzero(frames_astray(shown)).tolist() == [3, 11]
+    # Also where exposures were not divided out.
+    shown += np.resize([-2.8, 0, 2.8], FRAMES).astype(np.float32)
+    assert np.flatnonzero(frames_astray(shown)).tolist() == [3, 11]
 
 
 def test_exposures_mirrors_white_walls_and_few_points_are_no_wrong_poses():
