@@ -311,6 +311,7 @@ ENGINEERING: dict[str, str] = {
     "_MIN_BASELINE": "limit of what is refused",
     "_MIN_FRAMED_SHARE": "limit of what is refused",
     "_MIN_HIT_SHARE": "limit of what is refused",
+    "_MIN_SPREAD": "geometry: cameras that do not stand in one place",
     "_MIN_USEFUL_SHARE": "limit of what is refused",
     "_MIXED": "discretisation of a mean",
     "_MORE": "steps of a search",

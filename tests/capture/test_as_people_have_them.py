@@ -612,7 +612,7 @@ def test_what_both_mask_and_alpha_hide_is_hidden_once(made):
 
 def test_a_mesh_in_millimetres_beside_poses_in_metres(made):
     write_ply(made.folder / "mesh.ply", 1000 * made.points, made.triangles, made.face_object)
-    with pytest.raises(InputRefused, match=r"one unit\. \[capture\.parallax\]$"):
+    with pytest.raises(InputRefused, match=r"a mesh in millimetres .*\[capture\.parallax\]$"):
         _read(made)
 
 

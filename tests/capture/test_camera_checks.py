@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.scenes import edited, make_capture, write_ply
 from usdbrdf.capture import camera_checks
+from usdbrdf.capture.adapters import read_scan
 from usdbrdf.errors import InputRefused
+from usdbrdf.options import IngestOptions
 
 PROBE = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 
@@ -18,6 +21,7 @@ def _shares(monkeypatch, *, own, others, framed):
         return own if np.array_equal(read(PROBE), PROBE) else others
 
     monkeypatch.setattr(camera_checks, "_hit_share", hit)
+    monkeypatch.setattr(camera_checks, "_units", lambda scene, frames: {})
     monkeypatch.setattr(camera_checks, "_framed_share", lambda scene, frames: framed)
 
 
@@ -34,3 +38,27 @@ def test_readings_that_hit_clearly_more_are_named(monkeypatch):
     _shares(monkeypatch, own=0.12, others=0.5, framed=0.9)
     with pytest.raises(InputRefused, match=r"Other readings of the poses would hit: .*50%"):
         camera_checks.refuse_rays_that_miss(None, None, Path("room"))
+
+
+@pytest.mark.fault("C7")
+@pytest.mark.parametrize(
+    ("larger", "rule", "unit"),
+    [
+        (1000.0, "convention", "would hit: positions in millimetres and a mesh in metres"),
+        (100.0, "convention", "would hit: positions in centimetres and a mesh in metres"),
+        (0.001, "parallax", "have not if they are positions in metres and a mesh in millimetres"),
+    ],
+)
+@pytest.mark.parametrize("axes", [1, -1], ids=["OpenGL", "OpenCV"])
+def test_the_unit_that_would_fit_is_named(tmp_path, larger, rule, unit, axes):
+    """Also where the axes are mixed up too."""
+    made = make_capture(tmp_path / "scan")
+    with edited(made.manifest) as document:
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"]) @ np.diag([1, axes, axes, 1])
+            pose[:3, 3] *= larger if rule == "convention" else 1
+            frame["transform_matrix"] = pose.tolist()
+    if rule == "parallax":
+        write_ply(made.folder / "mesh.ply", made.points / larger, made.triangles, made.face_object)
+    with pytest.raises(InputRefused, match=rf"{unit} .*\[capture\.{rule}\]$"):
+        read_scan(made.folder, IngestOptions())

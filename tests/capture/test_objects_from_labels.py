@@ -7,9 +7,12 @@ import json
 import numpy as np
 import pytest
 
+from tests.scenes import make_capture
+from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.parts import label_table, objects_with_faces, segmentation
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.mesh import ObjectName
+from usdbrdf.options import IngestOptions
 from usdbrdf.untrusted.mesh_files import FileMesh
 
 
@@ -108,3 +111,24 @@ def test_a_directive_that_is_none_is_refused(tmp_path):
         InputRefused, match=r"'gold' of object 4 is none of .*\[objects.directive\]$"
     ):
         label_table(path)
+
+
+@pytest.mark.fault("G10")
+def test_ids_that_count_from_another_number_are_told(tmp_path):
+    """As the names are wrong then; a list of more names than are used is none."""
+    made = make_capture(tmp_path / "scan")
+    path = made.folder / "objects.json"
+    document = json.loads(path.read_text())
+    document["objects"].append({"id": 900, "name": "nowhere"})
+    path.write_text(json.dumps(document))
+    assert read_scan(made.folder, IngestOptions()).warnings == ()
+    for row in document["objects"]:
+        row["id"] += 1
+    path.write_text(json.dumps(document))
+    (told,) = read_scan(made.folder, IngestOptions()).warnings
+    highest = len(made.names)
+    assert told.startswith(
+        "objects.json: faces have ids that it does not name (0), and it names ids that no face has "
+        f"({highest}, 901)."
+    )
+    assert told.endswith("[objects.ids]")

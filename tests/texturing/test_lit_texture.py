@@ -41,9 +41,7 @@ def test_what_was_measured_stays_and_the_rest_takes_after_it(trio: World):
     count = np.zeros(3 * OWN, int)
     count[:OWN:2], count[2 * OWN] = 5, 1
     median = np.where(np.arange(3 * OWN)[:, None] < OWN, [0.1, 0.2, 0.4], [7.0, 8, 9])
-    found = _filled_in(
-        trio.texels, _measured(count, 0 * count, median.astype(np.float32)), {"a": 2}
-    )
+    found = _filled_in(trio.texels, _measured(count, 0 * count, median.astype(np.float32)))
     np.testing.assert_allclose(found.lit[:OWN], median[:OWN], rtol=1e-5)
     np.testing.assert_allclose(found.mean[:OWN], 3 * median[:OWN], rtol=1e-5)
     np.testing.assert_allclose(found.lit[2 * OWN :], median[2 * OWN :], rtol=1e-5)
@@ -51,7 +49,6 @@ def test_what_was_measured_stays_and_the_rest_takes_after_it(trio: World):
     np.testing.assert_array_equal(found.spread, np.where(count[:, None] > 0, [0.25] * 3, 0))
     assert found.coverage.measured.tolist() == (count > 0).tolist()
     assert not found.coverage.clipped.any()
-    assert found.contradicting == {"a": 2}
 
 
 def test_what_clips_in_every_frame_is_at_least_as_bright_as_that(trio: World):
@@ -62,7 +59,7 @@ def test_what_clips_in_every_frame_is_at_least_as_bright_as_that(trio: World):
     clipped[OWN // 4 : OWN] = 2  # some of it beside samples, which count
     clipped[2 * OWN : 2 * OWN + 40] = 4
     bound = np.where(np.arange(3 * OWN) % 2, 1.5, 6.0).astype(np.float32)
-    found = _filled_in(trio.texels, _measured(count, clipped, bound=bound), {})
+    found = _filled_in(trio.texels, _measured(count, clipped, bound=bound))
     np.testing.assert_allclose(found.lit[: OWN // 2], 2)
     wanted = np.maximum(2, bound[OWN // 2 : OWN, None])
     np.testing.assert_allclose(found.lit[OWN // 2 : OWN], np.tile(wanted, (1, 3)), rtol=1e-5)
@@ -83,7 +80,7 @@ def test_a_neighbours_pixels_are_no_bounds_of_an_object(trio: World):
     count[:OWN] = 3
     clipped[OWN] = 1
     bound = np.full(3 * OWN, 50, np.float32)
-    found = _filled_in(trio.texels, _measured(count, clipped, bound=bound), {})
+    found = _filled_in(trio.texels, _measured(count, clipped, bound=bound))
     np.testing.assert_allclose(found.lit[OWN], 50)
     np.testing.assert_allclose(found.lit[OWN + 1 : 2 * OWN], 2, rtol=1e-5)
     np.testing.assert_allclose(found.mean[OWN : 2 * OWN], 6, rtol=1e-5)
@@ -99,7 +96,7 @@ def test_a_thing_too_thin_to_be_measured_is_known_by_glimpses(trio: World):
     told = _measured(count, clipped, bound=np.where(clipped > 0, 9, 0).astype(np.float32))
     own = np.where(glimpsed[:, None], np.float32(0.5), told.median)
     told = replace(told, median=own, mean=np.where(glimpsed[:, None], own, told.mean))
-    found = _filled_in(trio.texels, replace(told, glimpsed=glimpsed), {})
+    found = _filled_in(trio.texels, replace(told, glimpsed=glimpsed))
     np.testing.assert_allclose(found.lit[:OWN], 2, rtol=1e-5)
     np.testing.assert_allclose(found.lit[OWN : 2 * OWN], 0.5, rtol=1e-5)
     np.testing.assert_allclose(found.mean[OWN : 2 * OWN], 0.5, rtol=1e-5)
@@ -117,10 +114,10 @@ def test_a_thing_too_thin_to_be_measured_is_known_by_glimpses(trio: World):
 def test_a_scan_of_which_nothing_is_seen_is_refused_with_its_texels_size(trio: World):
     none = np.zeros(3 * OWN, int)
     with pytest.raises(InputRefused, match=r"texels of 0\.125 m.*\[texturing.unseen\]"):
-        _filled_in(trio.texels, _measured(none, none), {})
+        _filled_in(trio.texels, _measured(none, none))
     clipped = none.copy()
     clipped[7] = 1
-    assert _filled_in(trio.texels, _measured(none, clipped), {}).coverage.clipped[7]
+    assert _filled_in(trio.texels, _measured(none, clipped)).coverage.clipped[7]
 
 
 def _seen(share: float, **more) -> LitTexture:

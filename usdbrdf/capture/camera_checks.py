@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.checks import Findings, spread_evenly
-from usdbrdf.capture.conventions import CONVENTIONS
+from usdbrdf.capture.conventions import CONVENTIONS, UNITS
 from usdbrdf.errors import InputRefused
 from usdbrdf.geometry.sides import Sides
 from usdbrdf.model.arrays import Double
@@ -19,6 +19,7 @@ from usdbrdf.transport.rays import RayScene
 
 _MIN_BASELINE = 1e-3  # of the scene's diagonal
 _MIN_HIT_SHARE = 0.2
+_MIN_SPREAD = 0.1  # of the scene's diagonal, of cameras whose positions are read in another unit
 # Times as many rays that another reading of the poses must let hit: of a mesh of a part of what the
 # pictures show, any hits some.
 _CLEARLY_MORE = 1.5
@@ -30,18 +31,37 @@ _MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
 
 
-def refuse_without_parallax(frames: Frames, mesh: ScanMesh, source: Path) -> None:
-    """InputRefused where all cameras stand at one point: nothing but a panorama."""
-    centres = frames.world_from_camera[:, :3, 3]
-    spread = float(np.linalg.norm(np.ptp(centres, axis=0)))
-    diagonal = float(np.linalg.norm(np.ptp(mesh.points.astype(np.float64), axis=0)))
-    if spread < _MIN_BASELINE * diagonal:
-        raise InputRefused(
-            f"{source}: all {len(frames)} cameras stand within {spread:.3g} of one point in a "
-            f"scene {diagonal:.3g} across, there is no parallax. Capture from several places, or "
-            "check the translations of the poses, and that these and the mesh have one unit. "
-            "[capture.parallax]"
-        )
+def refuse_without_parallax(frames: Frames, scene: RayScene, source: Path) -> None:
+    """InputRefused where all cameras stand at one point: nothing but a panorama, or positions in
+    a far larger unit than the mesh's, which is named where cameras would stand apart in it."""
+    spread, diagonal = _spread(frames.world_from_camera), _diagonal(scene)
+    if spread >= _MIN_BASELINE * diagonal:
+        return
+    hits = {name: _hit_share(scene, frames, read) for name, read in _units(scene, frames).items()}
+    fit = [name for name, share in hits.items() if share >= _MIN_HIT_SHARE]
+    unit = f", as they have not if they are {fit[0]}" if fit else ""
+    raise InputRefused(
+        f"{source}: all {len(frames)} cameras stand within {spread:.3g} of one point in a "
+        f"scene {diagonal:.3g} across, there is no parallax. Capture from several places, or "
+        f"check the translations of the poses, and that these and the mesh have one unit{unit}. "
+        "[capture.parallax]"
+    )
+
+
+def _units(scene: RayScene, frames: Frames) -> dict[str, Callable[[Double], Double]]:
+    """Readings of the positions in other units, but for those under which all cameras would stand
+    in one place: from there everything may be hit."""
+    least, poses = _MIN_SPREAD * _diagonal(scene), frames.world_from_camera
+    return {n: read for n, read in UNITS.items() if _spread(np.stack([*map(read, poses)])) > least}
+
+
+def _spread(poses: Double) -> float:
+    """How far apart cameras (N, 4, 4) stand."""
+    return float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0)))
+
+
+def _diagonal(scene: RayScene) -> float:
+    return float(np.linalg.norm(np.ptp(scene.points.astype(np.float64), axis=0)))
 
 
 def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> float:
@@ -53,7 +73,8 @@ def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> floa
     share = _hit_share(scene, frames, lambda pose: pose)
     if share >= _MIN_HIT_SHARE:
         return share
-    tried = {name: _hit_share(scene, frames, read) for name, read in CONVENTIONS.items()}
+    readings = {**CONVENTIONS, **_units(scene, frames)}
+    tried = {name: _hit_share(scene, frames, read) for name, read in readings.items()}
     least = max(_MIN_HIT_SHARE, _CLEARLY_MORE * share)
     ranked = sorted(tried.items(), key=lambda one: -one[1])
     best = ranked[0][1]

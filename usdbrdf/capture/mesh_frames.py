@@ -4,6 +4,7 @@ cameras a document stands whose own mesh is that of the scene."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -14,11 +15,11 @@ from scipy.spatial import cKDTree
 from usdbrdf.errors import InputRefused, MeshMissing
 from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.files.tables import beginning_of
-from usdbrdf.model.arrays import Double, Float, Int
-from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.model.arrays import Double, Float, Int, Long
+from usdbrdf.model.mesh import ObjectName, ScanMesh
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import colmap_points
-from usdbrdf.untrusted.mesh_files import LABEL_PROPERTY, mesh_from_file
+from usdbrdf.untrusted.mesh_files import LABEL_PROPERTY, FileMesh, mesh_from_file
 from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
 from usdbrdf.untrusted.mesh_ply import LONGEST_HEADER, holds_points_alone, whole_number_of_faces
 from usdbrdf.untrusted.usd_paths import USD_SUFFIXES
@@ -87,6 +88,36 @@ def labels_of_others(mesh: Path) -> str:
     return (
         f" (its faces have {name!r}: call it {LABEL_PROPERTY} if it tells objects)" if name else ""
     )
+
+
+class LabelTable(NamedTuple):
+    """What objects.json says: name of each id, and optionally an id per face."""
+
+    entries: Mapping[int, ObjectName]
+    face_id: Long | None
+
+
+def doubts_about_ids(mesh: FileMesh, table: LabelTable, name: str) -> Iterator[str]:
+    """A sentence where objects.json names ids that no face has, while faces have others, as where
+    one of both counts from 1."""
+    ids = mesh.face_label if table.face_id is None else table.face_id
+    if ids is None:
+        return
+    used = set(np.unique(ids).tolist())
+    # Faces may have names in the mesh itself, whose numbers count from 0 on.
+    unnamed = sorted(n for n in used.difference(table.entries) if n >= len(mesh.label_names))
+    idle = sorted(table.entries.keys() - used)
+    if unnamed and idle:
+        yield (
+            f"{name}: faces have ids that it does not name ({_listed(unnamed)}), and it names ids "
+            f"that no face has ({_listed(idle)}). If one of both counts from 1, or the ids are "
+            "those of another mesh, objects have the names of others: correct them. [objects.ids]"
+        )
+
+
+def _listed(ids: Sequence[int]) -> str:
+    more = f" and {len(ids) - 3} more" if len(ids) > 3 else ""
+    return ", ".join(map(str, ids[:3])) + more
 
 
 def scene_above(document: Path) -> Path | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import wraps
 from inspect import signature
@@ -28,7 +28,7 @@ from usdbrdf.capture.checks import (
     with_masks,
 )
 from usdbrdf.capture.develop import frames_of_photographs
-from usdbrdf.capture.mesh_frames import labels_of_others
+from usdbrdf.capture.mesh_frames import LabelTable, doubts_about_ids, labels_of_others
 from usdbrdf.capture.rigid_poses import rigid_records
 from usdbrdf.errors import InputRefused, MeshMissing, UsageError, UsdBrdfError
 from usdbrdf.files.colour import kind_of_encoding, known_encodings, unknown_encoding
@@ -42,7 +42,7 @@ from usdbrdf.geometry.normals import corner_normals
 from usdbrdf.geometry.sides import Sides, sides_from_cameras, turned_towards_cameras, with_backs
 from usdbrdf.geometry.unwrap import connected_triangles
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Int, Long
+from usdbrdf.model.arrays import Int
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import (
     DIRECTIVES,
@@ -64,13 +64,6 @@ P = ParamSpec("P")
 _MAX_OBJECTS = 65_535
 _LEAST_PART = calibration.number("objects.least_part")
 _ONE_OBJECT = (ObjectLabel(identifier="scan", label="scan"),)
-
-
-class LabelTable(NamedTuple):
-    """What objects.json says: name of each id, and optionally an id per face."""
-
-    entries: Mapping[int, ObjectName]
-    face_id: Long | None
 
 
 class Segmentation(NamedTuple):
@@ -267,6 +260,8 @@ def geometry_from_file(
         objects, mesh = None, replace(mesh, face_label=np.zeros(len(mesh.triangles), np.int64))
     objects_path = objects if isinstance(objects, Path) else None
     table = label_table(objects_path) if objects_path is not None else None
+    if table is not None and objects_path is not None:
+        findings.warnings += doubts_about_ids(mesh, table, objects_path.name)
     if callable(objects):
         table = objects(mesh)
         mesh, table = replace(mesh, face_label=table.face_id), table._replace(face_id=None)
@@ -370,9 +365,9 @@ def scan_from_parts(
     findings.refuse_too_few_frames(source, total, views=len(frames))
     geometry = read_geometry()
     findings.geometry = geometry
-    if not any(r.lens.curve == "equirectangular" for r in rigid):
-        refuse_without_parallax(frames, geometry.mesh, source)
     rays = RayScene(geometry.mesh.points, geometry.mesh.triangles)
+    if not any(r.lens.curve == "equirectangular" for r in rigid):
+        refuse_without_parallax(frames, rays, source)
     hit_share = refuse_rays_that_miss(frames, rays, source)
     usable = check_frames(
         photographs,

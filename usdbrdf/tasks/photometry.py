@@ -42,7 +42,7 @@ def asked_of_its_pixels(
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     surface, rays = surface_and_rays(scan.mesh)
     refuse_turned(surface, rays, scan.frames, scan.turned_images, read, scan.source)
-    agrees = agreement_of_frames(surface, rays, scan.frames, read, scan.source)
+    agrees, _ = agreement_of_frames(surface, rays, scan.frames, read, scan.source)
     warnings = warned(doubts_about_agreement(agrees, scan.source))
     estimate = options.vignetting == "estimate"
     scan, told, doubts = asked_of_its_optics(scan, surface, rays, read, estimate=estimate)

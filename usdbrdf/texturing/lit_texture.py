@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.model.arrays import Array, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
+from usdbrdf.texturing.astray import doubts_about_places, frames_astray
 from usdbrdf.texturing.earlier import GoingOn
 from usdbrdf.texturing.exposures import Probes, contradicting_frames, probed_texels
 from usdbrdf.texturing.inpaint import inpaint_alike, telling
@@ -40,6 +41,7 @@ class LitTexture:
     coverage   what is known of each texel
     contradicting  image and gain of the frames that show the same texels brighter or darker than
                    the others do
+    misplaced      a sentence on the frames that show other things than the rest do
     """
 
     lit: Float
@@ -48,9 +50,11 @@ class LitTexture:
     samples: Float
     coverage: CoverageMap
     contradicting: dict[str, float] = field(default_factory=dict)
+    misplaced: tuple[str, ...] = ()
 
     def doubts(self) -> Iterator[str]:
         """Sentences about what a person should look at."""
+        yield from self.misplaced
         unmeasured = 1 - float(self.coverage.measured.mean())
         if unmeasured > _MOSTLY:
             yield (
@@ -80,7 +84,7 @@ def lit_texture_from_frames(
     run       keeps what is done, should it be interrupted
     going_on  in which order frames come, and what is known of the first of them
 
-    Raises InputRefused where no frame shows any surface.
+    Raises InputRefused where no frame shows any surface, and where many contradict the others.
     """
     texels = surface.texels
     frames = frames.at(going_on.order)
@@ -116,7 +120,14 @@ def lit_texture_from_frames(
     groups = groups_of_texels(texels, surface.scene, frames, memory)
     found = Measured(**in_passes(run, going_on.name("texels"), groups, measured))
     owner = texels.object_index()[probed_texels(len(texels), len(frames))]
-    return _filled_in(texels, found, contradicting_frames(frames, found.probes, owner))
+    astray = frames_astray(found.probes)
+    names = [path.name for path in frames.image_paths]
+    misplaced = tuple(doubts_about_places(astray, names, None))
+    # How bright a frame shows what it does not look at says nothing.
+    probes = np.where(astray, np.float32(np.nan), found.probes)
+    contradicting = contradicting_frames(frames, probes, owner)
+    lit = _filled_in(texels, found)
+    return replace(lit, contradicting=contradicting, misplaced=misplaced)
 
 
 class _Shown(NamedTuple):
@@ -155,7 +166,7 @@ def _seen_by_frames(
     return observed.arrays()
 
 
-def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float]) -> LitTexture:
+def _filled_in(texels: Texels, found: Measured) -> LitTexture:
     """L_d and the mean everywhere: measured, or inpainted from what was measured on the same
     object. An object that only ever clipped is known by those bounds alone, and one too thin for
     more by glimpses."""
@@ -187,5 +198,4 @@ def _filled_in(texels: Texels, found: Measured, contradicting: dict[str, float])
         spread=np.nan_to_num(found.spread),
         samples=found.count.astype(np.float32),
         coverage=CoverageMap.of(measured, clipped, glimpsed),
-        contradicting=contradicting,
     )

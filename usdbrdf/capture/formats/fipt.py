@@ -21,8 +21,7 @@ import numpy as np
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.formats.named_pictures import scan_of
-from usdbrdf.capture.mesh_frames import mesh_beside
-from usdbrdf.capture.parts import LabelTable
+from usdbrdf.capture.mesh_frames import LabelTable, mesh_beside
 from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused

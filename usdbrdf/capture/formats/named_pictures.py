@@ -13,9 +13,8 @@ from pathlib import Path, PurePosixPath
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
 from usdbrdf.capture.develop import with_rims
-from usdbrdf.capture.mesh_frames import folder_of_masks, path_in_capture
+from usdbrdf.capture.mesh_frames import LabelTable, folder_of_masks, path_in_capture
 from usdbrdf.capture.parts import (
-    LabelTable,
     as_photographs,
     geometry_from_file,
     radiance_encoding,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from usdbrdf.capture.parts import LabelTable
+from usdbrdf.capture.mesh_frames import LabelTable
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.arrays import Bool, Double, Long

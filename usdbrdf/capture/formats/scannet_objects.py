@@ -9,7 +9,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from usdbrdf.capture.parts import LabelTable
+from usdbrdf.capture.mesh_frames import LabelTable
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_json
 from usdbrdf.model.arrays import Int, Long
