@@ -313,6 +313,15 @@ def test_a_step_does_not_go_on_in_an_asset_of_a_newer_version(built):
         task.run(lambda run: {})
 
 
+def test_a_step_does_not_build_upon_layers_of_a_newer_version(built):
+    with edited(built.asset.layer("scan")) as opened:
+        about = opened.customLayerData
+        about["usdbrdf"]["schemaVersion"] = 7
+        opened.customLayerData = about
+    with pytest.raises(InputRefused, match=r"\[asset\.newer\]"):
+        open_weaker(built.asset, "material")
+
+
 def test_who_renames_in_the_edits_is_told_where_that_goes(built):
     """The interface of a step stands in the same layer stack, where USD allows no relocates."""
     with edited(built.asset.edits_layer) as layer:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.scenes import make_capture
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.mesh_frames import doubts_about_ids
 from usdbrdf.capture.parts import label_table, objects_with_faces, segmentation
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.mesh import ObjectName
 from usdbrdf.options import IngestOptions
-from usdbrdf.untrusted.mesh_files import FileMesh
+from usdbrdf.untrusted.mesh_files import FileMesh, mesh_from_file
 
 
 def _squares(sides: list[float], **more) -> FileMesh:
@@ -132,3 +134,9 @@ def test_ids_that_count_from_another_number_are_told(tmp_path):
         f"({highest}, 901)."
     )
     assert told.endswith("[objects.ids]")
+    # A list of all classes there are, of which faces have some, and 0 for none.
+    path.write_text(json.dumps({"objects": [{"id": k, "name": f"n{k}"} for k in range(1, 900)]}))
+    table = label_table(path)
+    few = np.resize(np.array([0, 3, 5, 7]), len(made.face_object))
+    mesh = mesh_from_file(made.folder / "mesh.ply")
+    assert list(doubts_about_ids(replace(mesh, face_label=few), table, path.name)) == []

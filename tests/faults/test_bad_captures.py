@@ -553,6 +553,16 @@ def test_a_thing_that_is_small_in_its_pictures_is_no_mix_up(tmp_path):
     scan = read_scan(capture.folder, IngestOptions())
     assert len(scan.frames) == 12
     assert 2 <= scan.counts["rays_hit_percent"] < 20
+    # Nor is it where it stands at the origin, and any smaller unit brings the cameras nearer.
+    middle = (capture.points.min(axis=0) + capture.points.max(axis=0)) / 2
+    mesh = capture.triangles, capture.face_object
+    write_ply(capture.folder / "mesh.ply", (capture.points - middle).astype(np.float32), *mesh)
+    moved = np.outer([1, 0, 0, 0], [0, 0, 0, 1.0])
+    moved[:3, 3] = middle
+    _poses(lambda m: m - np.where(np.arange(4) == 3, moved, 0))(capture)
+    assert len(read_scan(capture.folder, IngestOptions()).frames) == 12
+    write_ply(capture.folder / "mesh.ply", capture.points, *mesh)
+    _poses(lambda m: m + np.where(np.arange(4) == 3, moved, 0))(capture)
     _poses(lambda m: m + np.outer([1, 0, 0, 0], [0, 0, 0, 1.5]))(capture)
     with pytest.raises(InputRefused, match=r"of the camera rays hit the mesh"):
         read_scan(capture.folder, IngestOptions())

@@ -14,7 +14,7 @@ from usdbrdf.job.task import TaskRun
 from usdbrdf.material.refined_irradiance import Lobes, let_through_surfaces, refined_irradiance
 from usdbrdf.model.texels import Coverage, CoverageMap
 from usdbrdf.shading.asked import Shining, irradiance_of_texels
-from usdbrdf.shading.panes import beside_panes, find_panes, what_shows_through
+from usdbrdf.shading.panes import Through, beside_panes, find_panes, what_shows_through
 from usdbrdf.shading.surroundings import surroundings_from_frames
 from usdbrdf.transport.brdf import DIELECTRIC
 from usdbrdf.transport.environment import Environment, black_environment, directions_of_pixels
@@ -108,6 +108,22 @@ def test_a_pane_is_known_from_a_few_frames_by_what_is_outside(tmp_path, what):
     run = TaskRun(tmp_path, "shade", tmp_path / "work")
     found = find_panes(run, surface, lit, coverage, frames, True)
     assert found == ((PANE,) if is_pane else ())
+
+
+@pytest.mark.parametrize(
+    ("slope", "error", "explained", "mirrored", "above", "is_pane"),
+    [
+        (0.47, 0.13, 0.32, 0.05, 1.9, True),  # few frames show the outside, and roughly
+        (0.47, 0.2, 0.32, 0.05, 1.9, False),  # it may be by chance
+        (0.09, 0.01, 0.05, 0.0, 0.7, False),  # clear, but of no pane
+        (0.7, 0.06, 0.63, 0.51, 0.5, False),  # a dark front, in which the window is seen
+        (0.47, 0.13, 0.32, 0.05, 0.1, False),  # no brighter than it would mirror
+    ],
+)
+def test_a_pane_follows_what_is_behind_it_beyond_chance(
+    slope, error, explained, mirrored, above, is_pane
+):
+    assert Through(slope, error, explained, mirrored, above).is_pane == is_pane
 
 
 def test_frames_show_the_sky_through_a_pane(tmp_path):

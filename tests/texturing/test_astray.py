@@ -11,7 +11,6 @@ import pytest
 
 import usdbrdf
 from tests.scenes import edited
-from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions, InspectOptions, TextureOptions
 from usdbrdf.tasks.inspect import inspect
 from usdbrdf.texturing.astray import doubts_about_places, frames_astray
@@ -56,6 +55,14 @@ def test_exposures_mirrors_white_walls_and_few_points_are_no_wrong_poses():
     wall = (1e-3 * rng.standard_normal(shown.shape)).astype(np.float32)
     wall[:, 5] *= 40
     assert not frames_astray(wall).any()
+    # A highlight that wanders over one plain table, and dark frames full of noise.
+    table = (0.01 * rng.standard_normal(shown.shape)).astype(np.float32)
+    for i in range(FRAMES):
+        table[30 * i : 30 * i + 150, i] += 2.5
+    assert not frames_astray(table).any()
+    plain = rng.uniform(-0.1, 0.1, (POINTS, 1)) + 0.01 * rng.standard_normal(shown.shape)
+    plain[:, ::3] += 0.4 * rng.standard_normal(plain[:, ::3].shape)
+    assert not frames_astray(plain.astype(np.float32)).any()
     shown = _shown()
     shown[:, 3] = np.roll(shown[:, 3], 200)
     shown[60:, 3] = np.nan
@@ -64,7 +71,7 @@ def test_exposures_mirrors_white_walls_and_few_points_are_no_wrong_poses():
 
 
 @pytest.mark.fault("C17")
-def test_a_few_are_named_and_many_refused():
+def test_they_are_named_with_what_may_be_the_cause():
     names = [f"{i:04d}.exr" for i in range(10)]
     astray = np.isin(np.arange(10), [2, 7])
     (said,) = doubts_about_places(astray, names, Path("room/transforms.json"))
@@ -73,10 +80,6 @@ def test_a_few_are_named_and_many_refused():
     assert list(doubts_about_places(astray & False, names, None)) == []
     # Of what was moved or switched between frames as much can be true.
     assert "poses of other frames, or something was moved, or lamps were switched" in said
-    third = astray | (np.arange(10) == 5)
-    assert len(list(doubts_about_places(third, names, None))) == 1
-    with pytest.raises(InputRefused, match=r"^room: 4 of 10 .* \[capture\.astray\]$"):
-        list(doubts_about_places(third | (np.arange(10) == 6), names, Path("room")))
 
 
 @pytest.mark.fault("C17")

@@ -73,16 +73,20 @@ def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> floa
     share = _hit_share(scene, frames, lambda pose: pose)
     if share >= _MIN_HIT_SHARE:
         return share
-    readings = {**CONVENTIONS, **_units(scene, frames)}
-    tried = {name: _hit_share(scene, frames, read) for name, read in readings.items()}
+    tried = {name: _hit_share(scene, frames, read) for name, read in CONVENTIONS.items()}
     least = max(_MIN_HIT_SHARE, _CLEARLY_MORE * share)
+    mixed_up = share == 0 or max(tried.values()) >= least
+    if not mixed_up and _framed_share(scene, frames) >= _MIN_FRAMED_SHARE:
+        return share
+    # Of a thing that cameras stand around, any unit by which they come nearer lets more rays hit:
+    # units only say what may be wrong where something is.
+    units = _units(scene, frames)
+    tried |= {name: _hit_share(scene, frames, read) for name, read in units.items()}
     ranked = sorted(tried.items(), key=lambda one: -one[1])
     best = ranked[0][1]
     better = [
         f"{name}: {hit:.0%}" for name, hit in ranked if hit >= max(least, best / _CLEARLY_MORE)
     ]
-    if not better and share > 0 and _framed_share(scene, frames) >= _MIN_FRAMED_SHARE:
-        return share
     if better:
         listed = "; ".join(better[:_LISTED])
         cure = f"Other readings of the poses would hit: {listed}. Convert the poses"

@@ -119,7 +119,8 @@ def _of_units() -> dict[str, Callable[[Double], Double]]:
     }
 
 
-# And of units, of which hits do not tell: from one point in a room everything is hit.
+# And of units, of which hits alone do not tell: from one point in a room everything is hit, and
+# cameras around a thing hit it more the nearer they are.
 UNITS = _of_units()
 
 

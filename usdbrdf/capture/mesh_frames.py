@@ -99,15 +99,17 @@ class LabelTable(NamedTuple):
 
 def doubts_about_ids(mesh: FileMesh, table: LabelTable, name: str) -> Iterator[str]:
     """A sentence where objects.json names ids that no face has, while faces have others, as where
-    one of both counts from 1."""
+    one of both counts from 1. 0 alone may be what is no object, but where all that follow are used.
+    """
     ids = mesh.face_label if table.face_id is None else table.face_id
     if ids is None:
         return
     used = set(np.unique(ids).tolist())
     # Faces may have names in the mesh itself, whose numbers count from 0 on.
-    unnamed = sorted(n for n in used.difference(table.entries) if n >= len(mesh.label_names))
+    named = len(mesh.label_names) if table.face_id is None else 0
+    unnamed = sorted(n for n in used.difference(table.entries) if n >= named)
     idle = sorted(table.entries.keys() - used)
-    if unnamed and idle:
+    if unnamed and idle and (unnamed != [0] or max(used) < len(used)):
         yield (
             f"{name}: faces have ids that it does not name ({_listed(unnamed)}), and it names ids "
             f"that no face has ({_listed(idle)}). If one of both counts from 1, or the ids are "

@@ -63,6 +63,11 @@ class Sources(NamedTuple):
     gloss: tuple[float, float] = (0.0, 0.0)
     stray: float = 0.0
 
+    def precision(self) -> Double:
+        """(K,): how much what is thought before the evidence counts for each."""
+        size = np.bincount(self.family + 1)[self.family + 1]
+        return np.asarray(self.deviation**-2.0 / np.where(self.family < 0, 1, size))
+
     def irradiance(self, log_radiance: Double) -> Double:
         """(N, 3) W/m^2 of all of them."""
         return np.asarray(np.einsum("kn,kc->nc", self.share, np.exp(log_radiance)))
@@ -128,7 +133,7 @@ def likeliest(asked: Asked, sources: Sources, *others: Double) -> Solution:
         nonlocal found, least
         other = solved(asked, sources, _begun(asked, sources, log_radiance))
         misfit = _misfit(asked, sources, other)
-        better = misfit < least
+        better = ~(misfit >= least)
         pairs = zip(other, found, strict=True)
         found = Solution(*(np.where(better, new, kept) for new, kept in pairs))
         least = np.where(better, misfit, least)
@@ -156,15 +161,15 @@ def _begun(asked: Asked, sources: Sources, log_radiance: Double) -> Solution:
 def _misfit(asked: Asked, sources: Sources, found: Solution) -> Double:
     """(3,) minus the logarithm of the likelihood of what the texels reflect, times what was thought
     of sources and albedos before the evidence, up to a constant."""
-    of_family = np.bincount(sources.family + 1)[sources.family + 1]
-    weight = sources.deviation**-2.0 / np.where(sources.family < 0, 1, of_family)
-    off = (found.log_radiance - sources.mean) ** 2 * weight[:, None]
+    off = (found.log_radiance - sources.mean) ** 2 * sources.precision()[:, None]
     one, other = sources.pairs.T
     beside = (found.log_radiance[one] - found.log_radiance[other]) / sources.apart[:, None]
     albedo = (found.log_albedo - found.mean) / _OF_SEGMENT
     over = np.maximum(found.log_albedo - np.log(_WHITEST), 0) / _AS_WHITE
     usual = (found.mean - _USUAL_ALBEDO[0]) / _USUAL_ALBEDO[1]
-    prior = off.sum(0) + (beside**2).sum(0) + (albedo**2 + over**2).sum(0) + usual**2
+    gloss = (found.gloss - sources.gloss[0]) / max(sources.gloss[1], _GIVEN)
+    of_segments = albedo**2 + over**2 + gloss**2
+    prior = off.sum(axis=0) + (beside**2).sum(axis=0) + of_segments.sum(axis=0) + usual**2
     model = _model(asked, sources, found)
     return np.asarray(0.5 * prior + _unlikely(asked, model, sources.stray))
 
@@ -299,8 +304,7 @@ def _add_priors(
     k, last = len(g), len(gradient) - 1
     index = np.arange(k)
     off = sources.mean[:, channel] - g
-    size = np.bincount(sources.family + 1)[sources.family + 1]
-    precision = sources.deviation**-2.0 / np.where(sources.family < 0, 1, size)
+    precision = sources.precision()
     curvature[index, index] += precision
     gradient[:k] += precision * off
     pull = sources.apart**-2.0

@@ -84,7 +84,7 @@ class Through(NamedTuple):
     @property
     def is_pane(self) -> bool:
         """Whether nothing but a pane does so."""
-        follows = self.slope - 2 * self.error > _SLOPE and self.explained > _EXPLAINED
+        follows = self.slope > max(_SLOPE, 3 * self.error) and self.explained > _EXPLAINED
         return follows and self.above > _ABOVE and self.explained > _OVER * self.mirrored
 
 

@@ -32,9 +32,7 @@ def asked_of_its_optics(
 ) -> tuple[Scan, dict[str, Any], list[str]]:
     """The scan, its frames' vignetting to be divided out if ``estimate``; what was found: stops
     that corners are darker by, and that the balance of red or blue to green is off by in the worst
-    frame; and a sentence for the user on each of them that is much, and on frames astray.
-
-    Raises InputRefused where too many are."""
+    frame; and a sentence for the user on each of them that is much, and on frames astray."""
     frames = scan.frames
     asked = spread_evenly(len(frames), _ASKED)
     images = read_frames(read, asked)

@@ -13,14 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf import calibration
-from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.texturing.exposures import gains_of_frames
 
 _LEAST = calibration.number("astray.least")
 _UNRELATED = calibration.number("astray.unrelated")
 _STANDING_OUT = calibration.number("astray.standing_out")
-_MOST = calibration.number("astray.most")
 # Points that a frame shares with two others, without which it is not judged.
 _FEWEST = 50
 _LISTED, _SEED = 6, 0
@@ -29,7 +27,9 @@ _LISTED, _SEED = 6, 0
 def frames_astray(logarithm: Float) -> Bool:
     """(N,) frames whose samples have next to nothing to do with what others show of the same
     points, and differ from these far more than these do from each other: a mirror looks different
-    in all of them, and a white wall hardly in any.
+    in all of them, and a white wall hardly in any. Where the others show much the same at all
+    points there is nothing to be unrelated to: there a highlight or noise makes frames differ.
+    Where about half of the frames are astray, none is found.
 
     logarithm  (P, N) of what frames show of points, NaN where they do not
     """
@@ -55,7 +55,9 @@ def frames_astray(logarithm: Float) -> Bool:
             far = _scatter(off[own, i])
             by_chance = _scatter(value[rng.permutation(own), i] - usual[own])
             others = float(among_others[own].mean())
-            astray[i] = far > max(_LEAST, _UNRELATED * by_chance, _STANDING_OUT * others)
+            # What has nothing to do with it differs by about as much as there is to differ by.
+            varied = far < 2 * _scatter(usual[own])
+            astray[i] = varied and far > max(_LEAST, _UNRELATED * by_chance, _STANDING_OUT * others)
     return astray
 
 
@@ -65,25 +67,16 @@ def _scatter(off: Double) -> float:
 
 
 def doubts_about_places(astray: Bool, names: Sequence[str], source: Path | None) -> Iterator[str]:
-    """A sentence that names the frames that are ``astray`` of those that were compared.
-
-    Raises InputRefused where these are more than a third, in the name of ``source``: fewer may have
-    looked at something that changed, of which texels' medians make the best.
-    """
+    """A sentence that names the frames that are ``astray`` of those that were compared."""
     off = [name for name, wrong in zip(names, astray.tolist(), strict=True) if wrong]
     if not off:
         return
     more = f" and {len(off) - _LISTED} more" if len(off) > _LISTED else ""
-    what = (
-        f"{len(off)} of {len(names)} frames that were compared show other things than the rest do "
-        f"at the same points of the mesh: {', '.join(off[:_LISTED])}{more}"
+    place = f"{source.name}: " if source else ""
+    yield (
+        f"{place}{len(off)} of {len(names)} frames that were compared show other things than the "
+        f"rest do at the same points of the mesh: {', '.join(off[:_LISTED])}{more}. Likely they "
+        "have the poses of other frames, or something was moved, or lamps were switched, between "
+        "frames. Correct the poses, leave these frames out, or make a capture of each state. "
+        "[capture.astray]"
     )
-    cure = (
-        "They have the poses of other frames, or something was moved, or lamps were switched, "
-        "between frames. Correct the poses, leave these frames out, or make a capture of each state"
-    )
-    if len(off) > _MOST * len(names):
-        where = f"{source}: " if source else ""
-        limit = f"(limit {_MOST:.0%} of the frames)"
-        raise InputRefused(f"{where}{what} {limit}. {cure}. [capture.astray]")
-    yield f"{f'{source.name}: ' if source else ''}{what}. {cure}. [capture.astray]"

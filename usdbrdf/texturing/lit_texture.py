@@ -84,7 +84,7 @@ def lit_texture_from_frames(
     run       keeps what is done, should it be interrupted
     going_on  in which order frames come, and what is known of the first of them
 
-    Raises InputRefused where no frame shows any surface, and where many contradict the others.
+    Raises InputRefused where no frame shows any surface.
     """
     texels = surface.texels
     frames = frames.at(going_on.order)

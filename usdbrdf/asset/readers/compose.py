@@ -60,8 +60,11 @@ def in_one_line(error: object) -> str:
 def open_weaker(asset: Asset, role: str) -> Usd.Stage:
     """The stage that the task of a role builds upon: only the layers weaker than its own. Never
     edits.usda: what an artist overrides must not flow back into the measurement.
-    InputRefused where one of the tasks before has not run."""
-    return _in_lighting(_sublayered(asset, _weaker_layers(asset, role)), asset)
+    InputRefused where one of the tasks before has not run, or a newer version made its layer."""
+    layers = _weaker_layers(asset, role)
+    stage = _sublayered(asset, layers)
+    refuse_newer(*layers)
+    return _in_lighting(stage, asset)
 
 
 def open_measured(asset: Asset) -> Usd.Stage:
@@ -196,9 +199,9 @@ def open_stage(layer: Path | Sdf.Layer) -> Usd.Stage:
             )
         if _RELOCATED in problems[0]:
             cure = (
-                "Relocates rename what a layer has by reference, and an asset's own layers stand "
-                "beside its edits.usda: take them out there, and rename in a layer that references "
-                "the asset."
+                "Relocates rename what a layer has by reference, not what stands beside it, as an "
+                "asset's own layers beside its edits.usda do: take them out there, and rename in a "
+                "layer that references the asset."
             )
         raise InputRefused(
             f"{subject}: the stage does not compose: {problems[0]}. {cure} [stage.open]"
