@@ -67,7 +67,8 @@ def free_places(
     # Neighbours are nearer to each other than to any surface: nothing stands between them.
     volume = float(np.prod(np.maximum(high - low, clearance)))
     step = float(np.clip(np.cbrt(volume / _NODES), 0.8 * clearance, 1.9 * clearance))
-    if volume / step**3 > _MOST_NODES:
+    # A cube root's cube is the number itself only to rounding.
+    if volume / step**3 > _MOST_NODES * (1 + 1e-9):
         least = _rounded_up(float(np.cbrt(volume / _MOST_NODES)) / 1.9)
         raise UsageError(
             f"--clearance {clearance:g}: too many places lie so close to each other in "
