@@ -5,8 +5,15 @@ Every message is one sentence or two: what was looked at, what was found, what t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+
+def first_of(names: Sequence[str], most: int = 3) -> str:
+    """The first of some names for a sentence, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 class UsdBrdfError(Exception):

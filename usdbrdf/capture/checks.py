@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from usdbrdf.errors import ImageRefused, InputRefused
+from usdbrdf.errors import ImageRefused, InputRefused, first_of
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import DISPLAY_SPACE, encoding_of_tag, kind_of_encoding, says_light
 from usdbrdf.files.frames import FramePixels, read_frame, read_frames
@@ -182,11 +182,10 @@ class Findings:
         """One sentence per rule."""
         for rule, frames in self._by_rule().items():
             self.count("frames_dropped", len(frames))
-            names = ", ".join(repr(frame.name) for frame in frames[:3])
-            more = f" and {len(frames) - 3} more" if len(frames) > 3 else ""
+            names = first_of([repr(frame.name) for frame in frames])
             whose = "" if len({frame.reason for frame in frames}) == 1 else "the first, as "
             self.warn(
-                f"{source.name}: {len(frames)} of {total} frames dropped, {names}{more}: "
+                f"{source.name}: {len(frames)} of {total} frames dropped, {names}: "
                 f"{whose}{frames[0].reason}. [{rule}]"
             )
 

@@ -20,7 +20,7 @@ import numpy as np
 from usdbrdf.capture.adapters import choose_adapter, read_with, refuse_missing
 from usdbrdf.capture.checks import DroppedFrame, Findings, spread_evenly
 from usdbrdf.capture.native import own_faces
-from usdbrdf.errors import ImageRefused, MeshMissing, UsageError, UsdBrdfError
+from usdbrdf.errors import ImageRefused, MeshMissing, UsageError, UsdBrdfError, first_of
 from usdbrdf.files.frames import read_frame
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Float
@@ -164,8 +164,7 @@ class Inspection:
         if self.mesh is not None:
             yield "mesh", self._mesh_row(self.mesh)
             names = [label.label for label in self.objects]
-            more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-            yield "objects", f"{len(names)}: {', '.join(names[:_LISTED])}{more}"
+            yield "objects", f"{len(names)}: {first_of(names, _LISTED)}"
         if self.agreement is not None:
             yield (
                 "agreement",
@@ -379,5 +378,4 @@ def _by_rule(dropped: Sequence[DroppedFrame]) -> dict[str, list[DroppedFrame]]:
 
 
 def _named(dropped: Sequence[DroppedFrame]) -> str:
-    names = ", ".join(repr(frame.name) for frame in dropped[:3])
-    return names + (f" and {len(dropped) - 3} more" if len(dropped) > 3 else "")
+    return first_of([repr(frame.name) for frame in dropped])

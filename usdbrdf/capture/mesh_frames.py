@@ -4,7 +4,7 @@ cameras a document stands whose own mesh is that of the scene."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from usdbrdf.errors import InputRefused, MeshMissing
+from usdbrdf.errors import InputRefused, MeshMissing, first_of
 from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double, Float, Int, Long
@@ -111,15 +111,11 @@ def doubts_about_ids(mesh: FileMesh, table: LabelTable, name: str) -> Iterator[s
     idle = sorted(table.entries.keys() - used)
     if unnamed and idle and (unnamed != [0] or max(used) < len(used)):
         yield (
-            f"{name}: faces have ids that it does not name ({_listed(unnamed)}), and it names ids "
-            f"that no face has ({_listed(idle)}). If one of both counts from 1, or the ids are "
-            "those of another mesh, objects have the names of others: correct them. [objects.ids]"
+            f"{name}: faces have ids that it does not name ({first_of([*map(str, unnamed)])}), and "
+            f"it names ids that no face has ({first_of([*map(str, idle)])}). If one of both counts "
+            "from 1, or the ids are those of another mesh, objects have the names of others: "
+            "correct them. [objects.ids]"
         )
-
-
-def _listed(ids: Sequence[int]) -> str:
-    more = f" and {len(ids) - 3} more" if len(ids) > 3 else ""
-    return ", ".join(map(str, ids[:3])) + more
 
 
 def scene_above(document: Path) -> Path | None:

@@ -25,7 +25,7 @@ from usdbrdf.capture.bracketed import (
     frame_of,
     frames_of_document,
 )
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, first_of
 from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.frames import CLIPPED_SHARE
@@ -78,10 +78,9 @@ def develop_raw(capture: Path, folder: Path) -> dict[str, Any]:
         )
     off = [files[i].name for i in np.flatnonzero(drift > _DRIFT)]
     if off:
-        named = ", ".join(off[:3]) + (f" and {len(off) - 3} more" if len(off) > 3 else "")
         warn(
             f"{source}: the camera's white balance drifts by up to {drift.max():.2f} stops "
-            f"({named}); one balance was used for all frames. [raw.balance]"
+            f"({first_of(off)}); one balance was used for all frames. [raw.balance]"
         )
     return {
         "frames": len(files),

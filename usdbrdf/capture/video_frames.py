@@ -27,7 +27,7 @@ from usdbrdf.capture.bracketed import (
 )
 from usdbrdf.capture.brackets import BRIGHT_CODE, DARK_CODE, Response, merge, response_from_brackets
 from usdbrdf.capture.checks import spread_evenly
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, first_of
 from usdbrdf.files.atomic import environment_failures, whole_folder
 from usdbrdf.files.documents import read_json, write_json
 from usdbrdf.files.images import needs_float, read_radiance, write_exr
@@ -187,10 +187,9 @@ def _exposures(
 def _refuse_missing(path: Path, video: _Video, there: Sequence[int]) -> None:
     missing = sorted(set(video.numbers) - set(there))
     if missing:
-        named = ", ".join(map(str, missing[:_LISTED]))
-        more = f" and {len(missing) - _LISTED} more" if len(missing) > _LISTED else ""
+        named = first_of([*map(str, missing)], _LISTED)
         raise InputRefused(
-            f"{path}: has no sound frame {named}{more}, which {video.source.name} names. Copy the "
+            f"{path}: has no sound frame {named}, which {video.source.name} names. Copy the "
             "video again, or take these frames out. [video.frames]"
         )
 
@@ -272,11 +271,10 @@ def _judge(video: _Video, off: Mapping[int, float]) -> None:
     """Says which frames contradict; InputRefused where more than a fifth do."""
     if not off:
         return
-    named = ", ".join(f"{n} ({stops:+.1f} stops)" for n, stops in list(off.items())[:_LISTED])
-    more = f" and {len(off) - _LISTED} more" if len(off) > _LISTED else ""
+    named = first_of([f"{n} ({stops:+.1f} stops)" for n, stops in off.items()], _LISTED)
     what = (
         f"{len(off)} of {len(video.numbers)} frames are brighter or darker beside those before and "
-        f"after them than their exposures say, {named}{more}"
+        f"after them than their exposures say, {named}"
     )
     if len(off) > _MOST * len(video.numbers):
         cure = "Correct the table"

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from usdbrdf.asset.maps import AssetMaps, camera_hits
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, first_of
 from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.evaluation.metrics import MIN_SAMPLES, MapError, map_error
 from usdbrdf.evaluation.report import (
@@ -381,5 +381,4 @@ def _nearest(texels: Texels, i: int, other: Texels, j: int) -> Int:
 
 
 def _some(scene: Scene) -> str:
-    names = [obj.identifier for obj in scene.objects]
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return first_of([obj.identifier for obj in scene.objects])

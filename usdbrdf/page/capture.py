@@ -11,6 +11,7 @@ import numpy as np
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.errors import first_of
 from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.frames import read_frame, read_frames
 from usdbrdf.job.progress import progress
@@ -158,7 +159,8 @@ def findings(
     ]
     if metals:
         told.append(
-            f"{len(metals)} {_by_count(len(metals), 'is a metal', 'are metals')}: {_few(metals)}."
+            f"{len(metals)} {_by_count(len(metals), 'is a metal', 'are metals')}: "
+            f"{first_of(metals, _MOST_NAMED)}."
         )
     if prior := count.get("prior"):
         told.append(
@@ -196,7 +198,7 @@ def findings(
         told.append(f"{lamps} {_by_count(lamps, 'is a lamp', 'are lamps')}.")
     if shining_parts:
         many = len(shining_parts)
-        parts = f"{_by_count(many, 'A part', 'Parts')} of {_few(shining_parts)}"
+        parts = f"{_by_count(many, 'A part', 'Parts')} of {first_of(shining_parts, _MOST_NAMED)}"
         told.append(f"{parts} {_by_count(many, 'shines', 'shine')}, too.")
     texture, shade = found["texture"], found["shade"]
     if "measured_fraction" in texture:
@@ -248,7 +250,7 @@ def _estimated_lamps(names: Sequence[str], *, never_observed: bool) -> list[str]
     if not names:
         return []
     count = len(names)
-    lamps = f"he {_by_count(count, 'lamp', 'lamps')} {_few(names)}"
+    lamps = f"he {_by_count(count, 'lamp', 'lamps')} {first_of(names, _MOST_NAMED)}"
     how = f"No photograph measures t{lamps}" if never_observed else f"T{lamps} clipped everywhere"
     what = _by_count(count, "its radiance is an estimate", "their radiances are estimates")
     return [f"{how}: {what}."]
@@ -257,8 +259,3 @@ def _estimated_lamps(names: Sequence[str], *, never_observed: bool) -> list[str]
 def _by_count(count: int, one: str, many: str) -> str:
     """What is said of one thing, or of none or several."""
     return one if count == 1 else many
-
-
-def _few(names: Sequence[str]) -> str:
-    more = len(names) - _MOST_NAMED
-    return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")

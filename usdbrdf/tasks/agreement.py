@@ -14,7 +14,7 @@ from usdbrdf.capture.conventions import CONVENTIONS, UNITS
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import Read, read_frames
 from usdbrdf.job.progress import progress
-from usdbrdf.model.arrays import Bool, Double, Float
+from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.agreement import (
     Agreement,
@@ -24,7 +24,6 @@ from usdbrdf.texturing.agreement import (
     logarithms_in_frame,
     other_convention,
 )
-from usdbrdf.texturing.astray import frames_astray
 from usdbrdf.transport.rays import RayScene
 
 ASKED = 16  # frames that are asked whether they agree
@@ -40,10 +39,10 @@ _STRIDE = 4
 
 def agreement_of_frames(
     surface: MeshPoints, rays: RayScene, frames: Frames, read: Read, source: Path
-) -> tuple[Agreement | None, Bool]:
-    """How far some frames agree, None where they see too few points in common, and which of these
-    do not stand where they say. Of much the user is to be told by ``doubts_about_agreement`` and
-    ``doubts_about_places``.
+) -> tuple[Agreement | None, Float]:
+    """How far some frames agree, None where they see too few points in common, and logarithms of
+    what these show of the points, (P, N). Of much the user is to be told by
+    ``doubts_about_agreement``.
 
     Raises InputRefused, in the name of ``source``, where they hardly do and would under another
     reading of the poses.
@@ -65,14 +64,14 @@ def agreement_of_frames(
 
     # Under wrong readings frames may agree as well, where most of a scene is one colour; but less.
     shown = looked_up(dict.fromkeys(_READINGS, _STRIDE) | {_AS_GIVEN: 1})
-    given, astray = agreement(shown[_AS_GIVEN]), frames_astray(shown[_AS_GIVEN])
-    shown[_AS_GIVEN] = shown[_AS_GIVEN][::_STRIDE]
-    found = {name: agreement(rows) for name, rows in shown.items()}
+    rows = shown[_AS_GIVEN]
+    given, shown[_AS_GIVEN] = agreement(rows), rows[::_STRIDE]
+    found = {name: agreement(some) for name, some in shown.items()}
     told = found.pop(_AS_GIVEN)
     if told and not is_doubtful(given) and not other_convention(told, found):
-        return given, astray
+        return given, rows
     every = {name: 1 for name in _READINGS if name != _AS_GIVEN}
-    found = {name: agreement(rows) for name, rows in looked_up(every).items()}
+    found = {name: agreement(some) for name, some in looked_up(every).items()}
     better = found.get(name := other_convention(given, found))
     if better is not None:
         differ = f"differ by {given.ratio:.0%} of what any two pixels do" if given else "share none"
@@ -81,4 +80,4 @@ def agreement_of_frames(
             f"({differ}); with the poses read as {name} they would differ by {better.ratio:.0%}. "
             "Convert the poses. [capture.convention]"
         )
-    return given, astray
+    return given, rows

@@ -21,7 +21,7 @@ from usdbrdf.tasks.capture_inputs import no_asset
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
 from usdbrdf.tasks.turned import frames_to_compare, refuse_turned
 from usdbrdf.texturing.agreement import doubts_about_agreement, surface_and_rays
-from usdbrdf.texturing.astray import doubts_about_places
+from usdbrdf.texturing.astray import doubts_about_places, frames_astray
 
 
 def inspect(
@@ -51,10 +51,10 @@ def inspect(
                 refuse_turned(surface, rays, frames, found.turned_images, read, capture)
             frames = developed_frames(spread_evenly(len(every), ASKED), folder)
             read = partial(read_frame, frames)
-            agrees, astray = agreement_of_frames(surface, rays, frames, read, capture)
+            agrees, shown = agreement_of_frames(surface, rays, frames, read, capture)
             names = [path.name for path in frames.image_paths]
             doubts = [*doubts_about_agreement(agrees, capture)]
-            doubts += doubts_about_places(astray, names, capture)
+            doubts += doubts_about_places(frames_astray(shown), names, capture)
             objects = found.objects
             if options.objects == AUTO:
                 frames = developed_frames(frames_that_tell_colours(mesh, len(every)), folder)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from usdbrdf.capture.checks import spread_evenly
+from usdbrdf.errors import first_of
 from usdbrdf.files.frames import Read, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.model.capture import Scan
@@ -57,11 +58,9 @@ def asked_of_its_optics(
             scan = replace(scan, frames=replace(frames, vignetting=falloff.coefficients))
     if drift is not None and drifts(drift).any():
         off = [names[k] for k in np.flatnonzero(drifts(drift))]
-        named = ", ".join(off[:_LISTED])
-        more = f" and {len(off) - _LISTED} more" if len(off) > _LISTED else ""
         doubts.append(
             f"{scan.source.name}: the white balance of {len(off)} of {len(asked)} frames is off "
-            f"that of the others, by {drift.max():.2f} stops at most: {named}{more}. Develop "
-            "all frames with one balance. [capture.balance]"
+            f"that of the others, by {drift.max():.2f} stops at most: {first_of(off, _LISTED)}. "
+            "Develop all frames with one balance. [capture.balance]"
         )
     return scan, told, doubts

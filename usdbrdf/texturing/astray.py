@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf import calibration
+from usdbrdf.errors import first_of
 from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.texturing.exposures import gains_of_frames
 
@@ -71,11 +72,10 @@ def doubts_about_places(astray: Bool, names: Sequence[str], source: Path | None)
     off = [name for name, wrong in zip(names, astray.tolist(), strict=True) if wrong]
     if not off:
         return
-    more = f" and {len(off) - _LISTED} more" if len(off) > _LISTED else ""
     place = f"{source.name}: " if source else ""
     yield (
         f"{place}{len(off)} of {len(names)} frames that were compared show other things than the "
-        f"rest do at the same points of the mesh: {', '.join(off[:_LISTED])}{more}. Likely they "
+        f"rest do at the same points of the mesh: {first_of(off, _LISTED)}. Likely they "
         "have the poses of other frames, or something was moved, or lamps were switched, between "
         "frames. Correct the poses, leave these frames out, or make a capture of each state. "
         "[capture.astray]"

@@ -61,20 +61,14 @@ def open_weaker(asset: Asset, role: str) -> Usd.Stage:
     """The stage that the task of a role builds upon: only the layers weaker than its own. Never
     edits.usda: what an artist overrides must not flow back into the measurement.
     InputRefused where one of the tasks before has not run, or a newer version made its layer."""
-    layers = _weaker_layers(asset, role)
-    stage = _sublayered(asset, layers)
-    refuse_newer(*layers)
-    return _in_lighting(stage, asset)
+    return _in_lighting(_sublayered(asset, _weaker_layers(asset, role)), asset)
 
 
 def open_measured(asset: Asset) -> Usd.Stage:
     """All layers that the tool wrote, without the artist's, in the asset's lighting."""
     refuse_converted(asset)
     common = replace(asset, lighting="")
-    layers = [common.layer(role) for role in ROLES]
-    stage = _sublayered(common, layers)
-    refuse_newer(*layers)
-    return _in_lighting(stage, asset)
+    return _in_lighting(_sublayered(common, [common.layer(role) for role in ROLES]), asset)
 
 
 def open_edited(asset: Asset) -> Usd.Stage:
@@ -266,6 +260,7 @@ def _sublayered(asset: Asset, layers: Sequence[Path]) -> Usd.Stage:
         if layer.is_file():
             open_metadata(layer)  # which names it, where USD would name the stage made here
     root.subLayerPaths = [*map(str, named)]
+    refuse_newer(*layers)
     return open_stage(root)
 
 

@@ -20,7 +20,7 @@ from usdbrdf.asset.readers.scene import (
     per_corner,
     triangulation_of,
 )
-from usdbrdf.errors import InputRefused
+from usdbrdf.errors import InputRefused, first_of
 from usdbrdf.files.colour import to_working_space
 from usdbrdf.files.images import image_size, is_eight_bit, read_exr, read_radiance
 from usdbrdf.geometry.normals import corner_normals
@@ -282,9 +282,7 @@ def surfaces_from_stage(
 
 def paths_of(prims: Sequence[Usd.Prim]) -> str:
     """The first of some prims for a sentence: path and type, and how many more there are."""
-    shown = [f"<{prim.GetPath()}> ({prim.GetTypeName()})" for prim in prims[:_MAX_SHOWN]]
-    more = len(prims) - len(shown)
-    return ", ".join(shown) + (f" and {more} more" if more else "")
+    return first_of([f"<{prim.GetPath()}> ({prim.GetTypeName()})" for prim in prims], _MAX_SHOWN)
 
 
 def metres_from_units(stage: Usd.Stage) -> Double:
