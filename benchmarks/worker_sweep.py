@@ -75,6 +75,11 @@ def main() -> int:
     return 1 if problems else 0
 
 
+def _hears_interrupts() -> None:
+    """What a shell starts in the background would not."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Sweep:
     """Runs in copies of one asset, as it was before each step."""
 
@@ -102,8 +107,11 @@ class Sweep:
             shutil.copytree(case, self.work / "ingested")
             seconds = {}
             for step in STEPS:
-                began, asset = time.perf_counter(), str(case / "asset")
-                self.run(case, step, asset, "--workers", self.workers, *self.options[step])
+                words = str(case / "asset"), "--workers", self.workers, *self.options[step]
+                process = self.started(case, step, *words)
+                self.reached(process, case / "asset", step)
+                began = time.perf_counter()
+                self.ended(case, step, process)
                 seconds[step] = time.perf_counter() - began
             self.run(case, *self.convert(case))
             found = {"seconds": seconds, "files": contents(case / "asset")}
@@ -133,12 +141,15 @@ class Sweep:
             return subprocess.Popen(
                 [sys.executable, "-m", "usdbrdf", *arguments, "-q"],
                 env={**os.environ, "TMPDIR": str(case / "tmp")},
-                stdout=told, stderr=told,
+                stdout=told, stderr=told, preexec_fn=_hears_interrupts,
             )  # fmt: skip
 
     def run(self, case: Path, *arguments: str) -> None:
-        if status := self.started(case, *arguments).wait():
-            raise SystemExit(f"{arguments[0]} ended with {status}: {(case / 'said').read_text()}")
+        self.ended(case, arguments[0], self.started(case, *arguments))
+
+    def ended(self, case: Path, name: str, process: subprocess.Popen[bytes]) -> None:
+        if status := process.wait():
+            raise SystemExit(f"{name} ended with {status}: {(case / 'said').read_text()}")
 
     def series(
         self, blow: str, moments: int, rng: np.random.Generator
