@@ -14,6 +14,7 @@ from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import ROLES
 from usdbrdf.asset.readers.compose import open_edited, open_measured, open_weaker
 from usdbrdf.asset.readers.scene import frames_from_stage, scene_from_stage
+from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused, OwnershipConflict
 from usdbrdf.model.mesh import ObjectLabel
 from usdbrdf.tasks.task import Task
@@ -320,6 +321,34 @@ def test_a_step_does_not_build_upon_layers_of_a_newer_version(built):
         opened.customLayerData = about
     with pytest.raises(InputRefused, match=r"\[asset\.newer\]"):
         open_weaker(built.asset, "material")
+
+
+@pytest.mark.fault("C13")
+@pytest.mark.parametrize(
+    "command",
+    [
+        "convert scan -o ROOM", "ingest scan -o ROOM", "texture ROOM", "shade ROOM", "fit ROOM",
+        "evaluate ROOM --views views.json -o new", "compare ROOM ROOM -o new",
+        "paper ROOM ROOM -o new", "relight ROOM -o new.exr", "package ROOM -o new.usdz",
+        "publish ROOM new", "report ROOM -o new.html", "view ROOM --no-browser", "advise ROOM",
+        "validate ROOM",
+    ],
+)  # fmt: skip
+def test_every_command_refuses_an_asset_whose_state_is_of_a_newer_version(
+    built, tmp_path, monkeypatch, capsys, command
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "views.json").write_text("{}")
+    state = built.asset.folder / ".usdbrdf"
+    state.mkdir()
+    (state / "job.json").write_text('{"schema": 2}')
+    words = [str(built.asset.folder) if word == "ROOM" else word for word in command.split()]
+    assert main(words) == 3
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "job.json: written by a newer usdbrdf (schema 2, this one knows 1). " in said
+    assert said.endswith("[asset.newer]")
+    assert not list(tmp_path.glob("new*"))
 
 
 def test_who_renames_in_the_edits_is_told_where_that_goes(built):

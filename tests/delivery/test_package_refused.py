@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import sys
 
 import numpy as np
 import pytest
@@ -127,6 +128,18 @@ def test_a_file_in_the_place_of_the_folder(room, tmp_path):
     # The root layer stands for its folder, as on the command line.
     found = package(room.asset.root_layer, tmp_path / "room.usdz")
     assert found["bytes"] == (tmp_path / "room.usdz").stat().st_size
+
+
+@pytest.mark.parametrize(
+    ("name", "told"), [("file/room.usdz", r"file.*\[environment\.io\]$"), ("a.glb", "needs Pillow")]
+)
+def test_what_cannot_be_written_is_refused_before_any_work(room, tmp_path, monkeypatch, name, told):
+    monkeypatch.setattr("usdbrdf.delivery.package.stage_in_look", pytest.fail)
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(EnvironmentFailure, match=told):
+        package(room.asset.folder, tmp_path / name)
+    assert sorted(os.listdir(tmp_path)) == ["capture", "file", "out"]
 
 
 @pytest.mark.parametrize(

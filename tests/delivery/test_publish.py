@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 import threading
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 
+from tests.asset.test_input_usd import INPUT, dress
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
 from tests.json_schemas import check
 from usdbrdf.asset.header import read_header
@@ -156,6 +158,31 @@ def test_versions_follow_each_other_and_never_change(room, tmp_path):
     assert bytes_of(dest / "v001") == first
     assert versions_in(dest) == ["v001", "v002"]
     assert publish(folder, dest, PublishOptions(version="v002"))["new"] is False
+
+
+def test_a_version_that_is_named_is_there_though_the_latest_holds_the_same(room, tmp_path):
+    """A pipeline that asked for v005 looks there."""
+    folder, dest = room.asset.folder, tmp_path / "dest"
+    publish(folder, dest)
+    told = publish(folder, dest, PublishOptions(version="v005"))
+    assert (told["publish"], told["version"], told["new"]) == (str(dest / "v005"), "v005", True)
+    assert read_manifest(dest / "v005").version == "v005"
+    assert next(changes(dest / "v005"), None) is None
+    assert publish(folder, dest, PublishOptions(version="v005"))["new"] is False
+    assert publish(folder, dest)["version"] == "v005"
+    with pytest.raises(UsageError, match=r"v005 is there already.*\[publish\.version\]$"):
+        publish(folder, dest, PublishOptions(version="v003"))
+    assert versions_in(dest) == ["v001", "v005"]
+
+
+@pytest.mark.parametrize(
+    "named", [{"version": "5"}, {"version": "v001/.."}, {"uri": "no address"}, {"uri": "a://{b}"}]
+)
+def test_what_can_be_no_name_is_refused_before_any_work(room, tmp_path, monkeypatch, named):
+    monkeypatch.setattr("usdbrdf.delivery.publish.edited_files", pytest.fail)
+    with pytest.raises(UsageError, match=r"\[publish\.\w+\]$"):
+        publish(room.asset.folder, tmp_path / "dest", PublishOptions(**named))
+    assert not (tmp_path / "dest").exists()
 
 
 def test_the_same_again_is_none_where_the_folder_is_named_by_a_relative_path(
@@ -645,6 +672,18 @@ def test_what_an_artist_references_keeps_its_own_purposes(room, tmp_path):
     assert np.allclose(*boxes, atol=0.1)
 
 
-def test_no_stand_ins_where_the_meshes_are_coarser(room, tmp_path):
+def test_no_stand_ins_where_the_meshes_are_coarser_which_is_said(room, tmp_path, capsys):
     publish(room.asset.folder, tmp_path / "dest", PublishOptions(proxies=10**7))
     assert not (tmp_path / "dest/v001/layers/proxies.usdc").exists()
+    (told,) = capsys.readouterr().err.splitlines()
+    said = rf"{room.asset.folder}: --proxies 10000000: no stand-ins were made, since its meshes "
+    assert re.search(said + r"have no more than \d+ triangles\.$", told)
+
+
+def test_no_stand_ins_of_geometry_that_came_as_usd_which_is_said(tmp_path, synthetic, capsys):
+    asset = dress(tmp_path, synthetic, INPUT).asset
+    capsys.readouterr()
+    told = publish(asset.folder, tmp_path / "dest", PublishOptions(proxies=1, unfinished=True))
+    assert not list(Path(told["publish"]).rglob("proxies.usdc"))
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if "proxies" in line]
+    assert told.endswith("came as USD, which keeps its own purposes.")

@@ -87,6 +87,18 @@ def test_light_of_primaries_that_are_not_known_is_told_and_that_of_no_file_as_su
         usdbrdf.evaluate(room.asset, views.manifest, tmp_path / "b", replace(LOW, environment=file))
 
 
+@pytest.mark.parametrize("what", ["environment", "truth"])
+def test_what_cannot_be_read_is_refused_before_all_photographs_are(
+    room, views, tmp_path, monkeypatch, what
+):
+    monkeypatch.setattr("usdbrdf.evaluation.evaluate_views.exposure_of_views", pytest.fail)
+    bad = tmp_path / "bad.exr"
+    bad.write_bytes(b"none")
+    with pytest.raises(InputRefused, match=r"bad\.exr"):
+        usdbrdf.evaluate(room.asset, views.manifest, tmp_path / "out", replace(LOW, **{what: bad}))
+    assert not (tmp_path / "out").exists()
+
+
 def test_all_files_are_there(found):
     output, result = found
     listed = {p.relative_to(output).as_posix() for p in output.rglob("*") if p.is_file()}

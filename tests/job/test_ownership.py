@@ -61,7 +61,7 @@ def test_damaged_record_is_written_again_and_a_newer_one_refused(tmp_path):
     own(tmp_path / "room")
     assert json.loads((state / "job.json").read_text())["schema"] == 1
     (state / "job.json").write_text('{"schema": 2}')
-    with pytest.raises(OwnershipConflict, match=r"ownership\.newer"):
+    with pytest.raises(InputRefused, match=r"asset\.newer"):
         own(tmp_path / "room")
 
 

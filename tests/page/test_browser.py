@@ -313,6 +313,47 @@ def test_a_page_that_was_opened_before_takes_nothing_back_that_others_said(opene
     assert found[second["prim"]].verdict == "accept"
 
 
+GONE = "/room/geo/sofa/sofa"
+
+
+def test_what_was_said_of_an_object_that_is_gone_is_shown_and_taken_back(opened, served, tmp_path):
+    asset, data, address = served
+    prim, kept = data["objects"][0]["prim"], Judgement(verdict="accept", status="prior", phi=0.5)
+    sofa = Judgement(verdict="reject", comment="not ours", directive="metal", status="prior")
+    write_review(asset, {prim: kept, GONE: sofa})
+    # A page that is a file hands all of it over, as long as nobody takes it back.
+    (tmp_path / "page.html").write_text(page({**data, **reviewed(asset)}), "utf-8")
+    for address_of_page in ((tmp_path / "page.html").as_uri(), address):
+        shown = opened(address_of_page)
+        item = shown.locator("#gone li")
+        assert item.inner_text().startswith(f"{GONE}: reject; for the next run metal; not ours")
+        if address_of_page == address:
+            break
+        with shown.expect_download() as download:
+            shown.get_by_role("button", name="Save verdicts").click()
+        download.value.save_as(asset.folder / "review.usda")
+        assert read_review(asset) == {prim: kept, GONE: sofa}
+    shown.get_by_role("button", name=f"Take back what was said of {GONE}").click()
+    shown.get_by_role("button", name="Save verdicts").click()
+    shown.get_by_text("saved in review.usda").wait_for()
+    assert read_review(asset) == {prim: kept}
+    assert shown.faults == []
+    assert opened(address).locator("#gone li").count() == 0
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1440, "light"), (390, "dark")])
+def test_what_was_said_of_what_is_gone_shuts_nobody_out(opened, page_file, tmp_path, width, scheme):
+    data = data_of(page_file.read_text("utf-8"))
+    data["review"] = {GONE: {"verdict": "reject", "comment": "x" * 200, "directive": ""}}
+    (tmp_path / "page.html").write_text(page(data), "utf-8")
+    shown = opened(
+        (tmp_path / "page.html").as_uri(),
+        viewport={"width": width, "height": 900}, color_scheme=scheme,
+    )  # fmt: skip
+    wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+    assert shown.evaluate(wide) <= 0
+
+
 @pytest.mark.parametrize(("width", "scheme"), [(1440, "light"), (390, "dark")])
 def test_nobody_is_shut_out(opened, page_file, width, scheme):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright")

@@ -18,7 +18,7 @@ from pxr import Usd
 import usdbrdf
 from tests.page.conftest import data_of, fit_of
 from usdbrdf.asset.maps import camera_hits
-from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView, measured_atlas, viewed_asset
 from usdbrdf.model.material import turned_up
 from usdbrdf.page import objects, views
@@ -190,6 +190,31 @@ def test_pages_are_refused_where_they_may_not_lie(room, tmp_path):
     with pytest.raises(OwnershipConflict, match="a folder has this name"):
         report(room.asset, tmp_path / "taken.html")
     assert not list(tmp_path.glob("*.pdf"))
+
+
+@pytest.mark.parametrize("what", ["review", "views", "evaluation", "environment"])
+def test_what_cannot_be_read_is_refused_before_the_long_work(room, tmp_path, monkeypatch, what):
+    monkeypatch.setattr("usdbrdf.page.report.objects_in_frames", pytest.fail)
+    folder = shutil.copytree(room.asset.parent, tmp_path / "made") / room.asset.name
+    bad = tmp_path / "bad.exr"
+    bad.write_bytes(b"none")
+    given = {} if what == "review" else {what: bad}
+    if what == "review":
+        (folder / "review.usda").write_text("#usda 1.0\n( nonsense")
+    elif what == "evaluation":
+        (tmp_path / "evaluation.json").write_text("{}")
+        given = {"evaluation": tmp_path}
+    with pytest.raises(InputRefused, match=r"review\.usda|bad\.exr|evaluation\.json"):
+        report(folder, tmp_path / "report.html", usdbrdf.ReportOptions(**given))
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_any_work(room, tmp_path, monkeypatch):
+    monkeypatch.setattr("usdbrdf.page.report.page_data", pytest.fail)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(EnvironmentFailure, match=r"file.*\[environment\.io\]$"):
+        report(room.asset, tmp_path / "file/report.html")
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_the_camera_of_a_part_sees_what_the_photograph_has_there(room, page_file):

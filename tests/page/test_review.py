@@ -181,6 +181,17 @@ def test_a_run_tells_of_objects_that_are_gone(built):
     assert notes_for_run(built.asset) == [gone]
 
 
+def test_what_was_said_of_an_object_that_is_gone_can_be_taken_back_and_nothing_else(built):
+    gone, chair = "/room/geo/sofa/sofa", Judgement(verdict="accept", phi=0.9)
+    write_review(built.asset, {gone: Judgement(directive="metal"), CHAIR: chair})
+    with pytest.raises(InputRefused, match=r"no object of this asset.*\[review\.page\]$"):
+        judgements_of(built.asset, {gone: {"verdict": "accept"}})
+    write_review(built.asset, judgements_of(built.asset, {gone: {"verdict": ""}}))
+    assert read_review(built.asset) == {CHAIR: chair}
+    with pytest.raises(InputRefused, match=r"no object of this asset"):
+        judgements_of(built.asset, {gone: {"verdict": ""}})
+
+
 @pytest.mark.parametrize(
     "content",
     [

@@ -14,9 +14,9 @@ import pytest
 
 from usdbrdf.asset.review import read_review, review_file
 from usdbrdf.cli import main
-from usdbrdf.errors import EnvironmentFailure
+from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.page import server as server_module
-from usdbrdf.page.server import PageServer
+from usdbrdf.page.server import PageServer, view
 
 CHAIR, WALL = "/room/geo/Stuhl_No_1/Stuhl_No_1", "/room/geo/wall/wall"
 
@@ -173,6 +173,26 @@ def test_an_address_that_is_taken_is_said(server, built):
     port = urlsplit(server.address).port
     with pytest.raises(EnvironmentFailure, match=r"--port\. \[view\.port\]$"):
         PageServer(built.asset, str, port)
+
+
+def test_view_says_that_an_address_is_taken_before_it_makes_the_page(server, built, monkeypatch):
+    monkeypatch.setattr(server_module, "page_data", pytest.fail)
+    with pytest.raises(EnvironmentFailure, match=r"\[view\.port\]$"):
+        view(built.asset.folder, port=urlsplit(server.address).port)
+
+
+def test_an_address_is_free_again_where_there_is_no_page(built, monkeypatch):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def refused(*_):
+        raise InputRefused("no page")
+
+    monkeypatch.setattr(server_module, "page_data", refused)
+    for _ in range(2):
+        with pytest.raises(InputRefused, match="no page"):
+            view(built.asset.folder, port=port)
 
 
 @pytest.mark.parametrize("browser", [True, False])

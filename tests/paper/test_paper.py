@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ import usdbrdf
 from tests.json_schemas import checked
 from usdbrdf.asset.layout import Asset
 from usdbrdf.cli import main
-from usdbrdf.errors import UsageError
+from usdbrdf.errors import UsageError, UsdBrdfError
 from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView
 from usdbrdf.files.images import image_size, read_radiance
 from usdbrdf.paper.figures import MOST_ACROSS, TellingViews, _scene_of, views_sheet
+from usdbrdf.paper.options import PaperOptions
 from usdbrdf.paper.tables import changes
+from usdbrdf.paper.write_paper import write_paper
 
 SMALL = ["--frames", "3", "--samples-per-pixel", "1", "--rays", "8", "--samples", "8"]
 
@@ -118,6 +121,24 @@ def test_an_artists_edits_are_in_no_figure(room):
 def test_an_output_inside_of_an_asset_is_refused(room, brighter):
     with pytest.raises(UsageError):
         usdbrdf.write_paper(room.asset, brighter.asset, brighter.asset / "paper")
+
+
+@pytest.mark.parametrize("what", ["views", "other_views", "environment", "truth", "denoise"])
+def test_what_cannot_be_had_is_refused_before_the_first_figure(
+    room, brighter, tmp_path, monkeypatch, what
+):
+    monkeypatch.setattr("usdbrdf.paper.write_paper.agreement", pytest.fail)
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    bad = tmp_path / "bad.exr"
+    bad.write_bytes(b"none")
+    of_views = {"environment", "truth"}
+    options = PaperOptions(
+        evaluate=usdbrdf.EvaluateOptions(**({what: bad} if what in of_views else {})),
+        **({} if what in of_views else {what: "oidn" if what == "denoise" else bad}),
+    )
+    with pytest.raises(UsdBrdfError, match=r"bad\.exr|oidn"):
+        write_paper(room.asset, brighter.asset, tmp_path / "out", options)
+    assert not (tmp_path / "out").exists()
 
 
 def test_changes_are_counted_apart():

@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -383,6 +384,19 @@ def test_what_stands_in_the_place_of_the_output_is_refused_before_rendering(
     status, said = _refused([str(room), "-o", str(tmp_path / "out"), "--views", str(views)], capsys)
     assert (status, "a folder of this name" in said) == (6, True)
     assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    "options", [{"camera": "/room/nobody"}, {"views": Path("bad.json")}], ids=["camera", "views"]
+)
+def test_what_cannot_be_read_is_refused_before_all_meshes_and_maps_are(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(sys.modules[relight.__module__], "render_scene_from_stage", pytest.fail)
+    monkeypatch.chdir(tmp_path)
+    Path("bad.json").write_text("{")
+    with pytest.raises(UsdBrdfError, match=r"nobody|bad\.json"):
+        relight(room, tmp_path / "out.exr", RelightOptions(**options))
 
 
 @pytest.mark.parametrize("exposure", [None, 1.0])

@@ -174,20 +174,20 @@ def _is_number(value: Any) -> bool:
 
 def judgements_of(asset: Asset, said: Any) -> dict[str, Judgement]:
     """What a page says, checked, beside what of each object is there to be judged now: by prim
-    path a dictionary of verdict, comment and directive. InputRefused for anything else."""
+    path a dictionary of verdict, comment and directive. Of what was judged once and is no object
+    any more it may be taken back. InputRefused for anything else."""
     if not isinstance(said, Mapping):
         raise InputRefused("the page's verdicts are no table of objects. [review.page]")
     maps = AssetMaps(open_measured(asset))
     paths = {obj.prim_path for obj in maps.scene.objects}
     before, found = read_review(asset), {}
     for path, record in said.items():
-        if path not in paths:
+        given, old = _judgement(record, f"<{path}>"), before.get(path)
+        if path not in paths and (old is None or given.says_something):
             raise InputRefused(f"<{path}>: no object of this asset has that path. [review.page]")
-        given = _judgement(record, f"<{path}>")
         if given.fault:
             raise InputRefused(f"<{path}>: {given.fault} [review.page]")
         words = given.verdict, given.comment, given.directive
-        old = before.get(path)
         if old and words == (old.verdict, old.comment, old.directive):
             found[path] = old  # judged then, of what was there then
         elif given.says_something:

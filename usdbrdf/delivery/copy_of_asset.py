@@ -105,7 +105,8 @@ def write_copy(
 
     write_collection(found, folder, edit=edit, write=write, encodings={root: encoding})
     if proxies is not None:
-        add_proxies(folder / root, folder / found.places[canonical(asset.contents_layer)], proxies)
+        contents = folder / found.places[canonical(asset.contents_layer)]
+        add_proxies(folder / root, contents, proxies, asset.folder)
     refuse_incomplete(folder / root)
     return found
 

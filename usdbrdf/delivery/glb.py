@@ -56,13 +56,8 @@ class GltfMaterial:
     wrap: str
 
 
-def write_glb(
-    output: Path, surfaces: Sequence[Surface], max_size: int | None, warn: Callable[[str], None]
-) -> dict[str, Any]:
-    """Write surfaces, in metres with y up, whole or not at all.
-
-    max_size  pixels of a texture's longer side; None for any
-    """
+def need_pillow() -> Any:
+    """``PIL.Image``; EnvironmentFailure where there is none."""
     try:
         from PIL import Image
     except ImportError as error:
@@ -70,6 +65,17 @@ def write_glb(
             ".glb needs Pillow, which is not installed. Run: pip install 'usdbrdf[package]'. "
             "[package.pillow]"
         ) from error
+    return Image
+
+
+def write_glb(
+    output: Path, surfaces: Sequence[Surface], max_size: int | None, warn: Callable[[str], None]
+) -> dict[str, Any]:
+    """Write surfaces, in metres with y up, whole or not at all.
+
+    max_size  pixels of a texture's longer side; None for any
+    """
+    image = need_pillow()
     if not surfaces:
         raise InputRefused(
             "no mesh of the asset is visible. Look at what edits.usda hides. [package.empty]"
@@ -84,7 +90,7 @@ def write_glb(
             name, number = f"{stem}_{number}", number + 1
         materials[name] = gltf_material(surface, max_size, warn)
         paths[name] = surface.name
-        pictures = {key: Image.fromarray(p) for key, p in materials[name].pictures.items()}
+        pictures = {key: image.fromarray(p) for key, p in materials[name].pictures.items()}
         dressed = _NamedMaterial(name=name, **pictures)
         scene.add_geometry(_mesh(surface, dressed), geom_name=name, node_name=name)
     content = export_glb(

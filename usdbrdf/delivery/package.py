@@ -36,7 +36,7 @@ from usdbrdf.asset.readers.surfaces import paths_of, surfaces_from_stage
 from usdbrdf.delivery.collection import OF_PHOTOGRAPHS, SCHEMAS_OF_PHOTOGRAPHS
 from usdbrdf.delivery.colours import ColourTextures, convert_layer, in_space
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
-from usdbrdf.delivery.glb import write_glb
+from usdbrdf.delivery.glb import need_pillow, write_glb
 from usdbrdf.delivery.low_poly import make_low_poly
 from usdbrdf.delivery.packaged_files import (
     EXR,
@@ -55,7 +55,13 @@ from usdbrdf.errors import (
     UsageError,
     UsdBrdfError,
 )
-from usdbrdf.files.atomic import environment_failures, folders_above, publish, temporary_beside
+from usdbrdf.files.atomic import (
+    environment_failures,
+    folders_above,
+    publish,
+    refuse_unwritable,
+    temporary_beside,
+)
 from usdbrdf.files.colour import WORKING_SPACE
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reads_asset
@@ -402,6 +408,8 @@ def _texture_format(output: Path, asset: Asset, options: PackageOptions) -> Lite
         raise UsageError(f"{output}: packages are {USDZ} or {GLB} files. [package.format]")
     if options.profile == ARKIT and suffix == GLB:
         raise UsageError(f"{output}: the ARKit profile is one of {USDZ}. [package.profile]")
+    if suffix == GLB:
+        need_pillow()
     eight_bit = options.profile == ARKIT or suffix == GLB
     if eight_bit and options.textures == EXR:
         raise UsageError(
@@ -426,6 +434,7 @@ def _texture_format(output: Path, asset: Asset, options: PackageOptions) -> Lite
     if output.is_dir():
         raise OwnershipConflict(f"{output}: a folder has this name. Choose another. [package.name]")
     asset.refuse_output(output, "package.output")
+    refuse_unwritable(output)
     return options.textures or ("png" if eight_bit else "exr")
 
 

@@ -14,23 +14,33 @@ from usdbrdf.asset.readers.compose import open_stage
 from usdbrdf.delivery.low_poly import CREASE_ANGLE_DEG
 from usdbrdf.geometry.mesh_clean import decimated
 from usdbrdf.geometry.normals import corner_normals
+from usdbrdf.job.progress import warn
 from usdbrdf.model.arrays import Float, Int
 
 PROXIES = "proxies.usdc"
 Types = Sdf.ValueTypeNames
 
 
-def add_proxies(root: Path, contents: Path, triangles: int) -> None:
+def add_proxies(root: Path, contents: Path, triangles: int, asset: Path) -> None:
     """Write the stand-ins of a copy's meshes beside its layer ``contents``, and name them there.
 
     root       root layer of the copy, which is not finished yet
-    triangles  about as many, of all together; where the meshes have no more nothing is written
+    triangles  about as many, of all together
+    asset      whose copy it is, for the sentence that says why there are none: where the meshes
+               have no more triangles, or none is ours
 
     Geometry that came as USD, with the capture or by the artist's hand, keeps its own purposes.
     """
     stage = open_stage(root)
     meshes = _meshes_of_objects(stage, contents.parent)
-    if sum(len(corners) for _, _, corners in meshes) <= triangles:
+    there = sum(len(corners) for _, _, corners in meshes)
+    if there <= triangles:
+        why = (
+            f"its meshes have no more than {there:,} triangles"
+            if meshes
+            else "its geometry came as USD, which keeps its own purposes"
+        )
+        warn(f"{asset}: --proxies {triangles}: no stand-ins were made, since {why}.")
         return
     layer = new_layer(read_header(root), Provenance(role="proxies", version=LAYOUT))
     first = np.cumsum([0, *(len(points) for _, points, _ in meshes)])

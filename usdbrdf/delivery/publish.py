@@ -49,8 +49,8 @@ def publish(
     """Write the asset in ``folder`` as the next version in ``destination``, a folder vNNN in it,
     whole or not at all; what was published before is not touched.
 
-    Where the latest version holds the same already, nothing is written. Equal assets give equal
-    bytes. Returns a summary of plain values.
+    Where the latest version holds the same already, nothing is written, unless ``options`` name a
+    version, which is there then. Equal assets give equal bytes. Returns a summary of plain values.
 
     wait_s, without_lock   as of ``pipeline.working_on``: the first of the asset and of
                            ``destination``, the second of ``destination``
@@ -61,6 +61,7 @@ def publish(
     """
     options = options or PublishOptions()
     asset = Asset.made(folder)
+    _refuse_names(options, asset.name)
     asset.refuse_output(destination, "publish.destination")
     if destination.exists() and not destination.is_dir():
         raise OwnershipConflict(
@@ -81,6 +82,17 @@ def publish(
             _locked(destination, wait_s, without_lock=without_lock),
         ):
             return _published(asset, destination, options)
+
+
+def _refuse_names(options: PublishOptions, name: str) -> None:
+    """UsageError for what can be no version's name or address, whatever the asset holds."""
+    version = options.version or "v001"
+    if not _VERSION.fullmatch(version):
+        raise UsageError(
+            f"--version {version}: versions are v and a number of three digits or more, such as "
+            "v001. [publish.version]"
+        )
+    _identifier(options.uri, name, version)
 
 
 def _refuse_unsound(asset: Asset, options: PublishOptions) -> None:
@@ -146,10 +158,11 @@ def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict
     latest = earlier[-1] if earlier else ""
     version = _version(options.version, latest, earlier)
     final = destination / version
-    like = destination / (version if version in earlier else latest)
+    # Who names a version is to find it, though the latest may hold the same.
+    like = destination / (version if options.version else latest)
     with temporary_folder(destination / _LOCKED / _STAGED / version) as staged:
         manifest = _write(asset, staged, version, options)
-        if earlier and manifest.content == _content_of(like):
+        if like.name in earlier and manifest.content == _content_of(like):
             return _summary(asset, like, read_manifest(like), new=False)
         if version in earlier:
             raise OwnershipConflict(
@@ -172,11 +185,6 @@ def _version(asked: str | None, latest: str, earlier: list[str]) -> str:
     number = int(latest[1:]) if latest else 0
     if asked is None:
         return f"v{number + 1:03d}"
-    if not _VERSION.fullmatch(asked):
-        raise UsageError(
-            f"--version {asked}: versions are v and a number of three digits or more, such as "
-            "v001. [publish.version]"
-        )
     if asked not in earlier and int(asked[1:]) <= number:
         raise UsageError(
             f"--version {asked}: {latest} is there already, and later versions have higher "

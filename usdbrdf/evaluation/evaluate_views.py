@@ -73,6 +73,8 @@ def evaluate(
     chosen = options or EvaluateOptions()
     place, atlas = measured_atlas(Path(asset), chosen.lighting)
     with report.output_folder(Path(output), DOCUMENT, (place,)) as work, scratch_folder() as folder:
+        # What may be refused is read before all photographs are.
+        seen = viewed_asset(place, atlas, chosen.environment)
         known = {}
         if chosen.truth is not None:
             albedo = _map_or(atlas, "base_color", "albedo")
@@ -81,7 +83,6 @@ def evaluate(
             Path(views), place, atlas.stage, atlas.scene, folder, chosen.allow_outside
         )
         exposure = exposure_of_views(photographs.frames)
-        seen = viewed_asset(place, atlas, chosen.environment)
         rows = score_views(work / "pictures", seen, photographs, exposure, chosen)
         report.write_table(work / "evaluation.csv", rows)
         report.write_plot(work / "evaluation.png", rows)

@@ -116,6 +116,17 @@ def folders_above(file: Path) -> Iterator[None]:
                 folder.rmdir()
 
 
+def refuse_unwritable(file: Path) -> None:
+    """EnvironmentFailure, before the work for it, where no file of this name could be written."""
+    with (
+        environment_failures(str(file)),
+        folders_above(file),
+        temporary_beside(file) as staged,
+        naming(file),
+    ):
+        staged.touch()
+
+
 def is_bare(folder: Path) -> bool:
     """Whether a folder holds nothing, or what a killed process of ours left of itself."""
     return all(entry.name.startswith(TEMPORARY_PREFIX) for entry in folder.iterdir())

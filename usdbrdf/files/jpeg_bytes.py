@@ -20,7 +20,8 @@ def jpeg_without_metadata(content: bytes) -> bytes:
             kept += part
         position = end
     scans = content[position:]
-    return kept + scans[: scans.find(END) + 2 or None]
+    end = scans.find(END)
+    return kept + (scans if end < 0 else scans[: end + len(END)])
 
 
 def segments_of_jpeg(content: bytes) -> Iterator[tuple[int, int]]:

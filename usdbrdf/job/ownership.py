@@ -125,7 +125,8 @@ def reading(*places: Path, wait_s: float = 0.0) -> Iterator[None]:
     Nothing happens for the thread that works in the folder itself, and in a folder without state: a
     published version never changes. A user who may not write reads the lock file only. Where there
     are no working locks, FolderBusy comes at the end, if a step has changed something meanwhile.
-    InputRefused: a run was stopped while it put its files in place, and they are of two runs.
+    InputRefused: a run was stopped while it put its files in place, and they are of two runs; or a
+    newer version made the asset.
     """
     with ExitStack() as held:
         for place in places:
@@ -170,6 +171,7 @@ def _reading(place: Path, wait_s: float) -> Iterator[None]:
     if is_held(state) or not state.is_dir():
         yield
         return
+    refuse_newer_state(state)
     with _shared(state / "lock", wait_s) as locked:
         if any(state.glob("publishing-*.json")):
             raise InputRefused(
@@ -274,8 +276,23 @@ def _wait_or_refuse(path: Path, deadline: float, holder: str) -> None:
 
 
 JOB_SCHEMA = 1
+_RECORD = "job.json"
 # Folders of an asset in which steps put files that they may replace.
 _WRITTEN = ("layers", "textures")
+
+
+def refuse_newer_state(state: Path) -> None:
+    """InputRefused where a newer version made the asset of this state folder: what it means by
+    what lies there this one cannot know."""
+    record, schema = state / _RECORD, None
+    with suppress(InputRefused):  # absent or damaged: it only says whose folder this is
+        document = read_json(record)
+        schema = document.get("schema") if isinstance(document, dict) else None
+    if isinstance(schema, int) and schema > JOB_SCHEMA:
+        raise InputRefused(
+            f"{record}: written by a newer usdbrdf (schema {schema}, this one knows {JOB_SCHEMA}). "
+            "Install that version, or convert the capture into a new folder. [asset.newer]"
+        )
 
 
 @contextmanager
@@ -283,7 +300,7 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
     """Make or accept an output folder and hold its lock; gives its state folder ``.usdbrdf``.
 
     A folder with files in it, no ``.usdbrdf/job.json`` and no records of steps that left all of its
-    layers and textures is somebody else's: OwnershipConflict.
+    layers and textures is somebody else's: OwnershipConflict; one of a newer version: InputRefused.
     Where nothing can be written: EnvironmentFailure. For FolderBusy and the options see
     ``folder_lock``. Where the work fails before anything is published, the folders that this call
     made are removed again, and nothing of another run.
@@ -303,17 +320,11 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
                         _remove_empty(state, made)
                     raise
             held.enter_context(_removed_if_unused(asset, made))
-            record, folders = state / "job.json", ("stamps", "work", "cache")
+            record, folders = state / _RECORD, ("stamps", "work", "cache")
             refuse_misplaced(asset, [record], [state / name for name in folders])
+            refuse_newer_state(state)
             try:
-                document = read_json(record)
-                schema = document.get("schema") if isinstance(document, dict) else None
-                if isinstance(schema, int) and schema > JOB_SCHEMA:
-                    raise OwnershipConflict(
-                        f"{record}: written by a newer usdbrdf (schema {schema}, this one knows "
-                        f"{JOB_SCHEMA}). Install that version or name another folder. "
-                        "[ownership.newer]"
-                    )
+                read_json(record)
             except InputRefused:  # absent or damaged: it only says whose folder this is
                 write_json(record, {"schema": JOB_SCHEMA, "tool": "usdbrdf"})
                 # Files of ours that a power cut spares would be nobody's without it.

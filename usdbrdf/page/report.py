@@ -26,7 +26,7 @@ from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import ViewedAsset, measured_atlas, viewed_asset
 from usdbrdf.evaluation.metrics import finite
-from usdbrdf.files.atomic import environment_failures, write_text_atomic
+from usdbrdf.files.atomic import environment_failures, refuse_unwritable, write_text_atomic
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.ownership import reading
 from usdbrdf.job.stamp import code_version
@@ -72,6 +72,7 @@ def report(
     if place.is_dir():
         raise OwnershipConflict(f"{place}: a folder has this name. Choose another. [report.output]")
     asset.refuse_output(place, "report.output")
+    refuse_unwritable(place)
     data = page_data(asset, options or ReportOptions())
     text = page(data)
     with environment_failures(str(place)):
@@ -106,21 +107,27 @@ def page(data: Mapping[str, Any], served: str = "") -> str:
 
 def page_data(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     """All that the page tells, as JSON."""
-    with reading(asset.folder):
-        return _data_of(asset, options)
+    with reading(asset.folder), scratch_folder() as folder:
+        return _data_of(asset, options, folder)
 
 
-def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
+def _data_of(asset: Asset, options: ReportOptions, folder: Path) -> dict[str, Any]:
+    """folder: for frames of lenses. What may be refused is read before the long work."""
     place, atlas = measured_atlas(asset.folder, options.lighting)
     _refuse_without_photographs(place, atlas.frames)
     # Where none is asked for it is the one that the asset opens in.
     place = place.in_lighting(atlas.lighting or None)
     up_axis = read_header(place.layer("scan")).up_axis
+    said, advice, pictures = reviewed(place), read_advice(place), options.photographs
+    # Pictures of ``evaluate`` are the photograph where the model has nothing to show.
+    folder_of_views = options.evaluation if pictures else None
+    scored = None if folder_of_views is None else evaluated_views(folder_of_views, place)
     seen = viewed_asset(place, atlas, options.environment)
+    views = _asked_views(place, atlas, options, folder)
     fits = [_in_own_frames(atlas, obj.prim_path) for obj in atlas.scene.objects]
     known = [fit for fit in fits if fit is not None]
     words = [status_of(atlas, i, fit) for i, fit in enumerate(fits)]
-    frames, found, advice = atlas.frames, summaries(place), read_advice(place)
+    frames, found = atlas.frames, summaries(place)
     chosen = _frames_to_search(len(frames), known)
     where = objects_in_frames(seen.lit.rays, atlas.scene.face_object, len(words), frames.at(chosen))
     reasons = [
@@ -129,15 +136,8 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
     ]
     lamps = [o.identifier for o, w in zip(atlas.scene.objects, words, strict=True) if w == "lamp"]
     widest = chosen[shows_most(where.share)]
-    pictures = options.photographs
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
-    with scratch_folder() as folder:
-        views = _asked_views(place, atlas, options, folder)
-        # Pictures of ``evaluate`` are the photograph where the model has nothing to show.
-        if options.evaluation is None or not pictures:
-            shown, rows = rendered_views(seen, views, pictures)
-        else:
-            shown, rows = evaluated_views(options.evaluation, place)
+    shown, rows = scored or rendered_views(seen, views, pictures)
     return {
         "name": place.name,
         "published": read_manifest(place.folder).version if place.is_published else "",
@@ -189,7 +189,7 @@ def _data_of(asset: Asset, options: ReportOptions) -> dict[str, Any]:
             place, atlas, seen.lit, frames.camera(widest), up_axis, options.environment
         ),
         "advice": None if advice is None else {"poses": advice[0], "current": advice[1]},
-        **reviewed(place),
+        **said,
     }
 
 

@@ -159,6 +159,10 @@ class PageServer:
         finally:
             self._server.server_close()
 
+    def release(self) -> None:
+        """The address, where nothing was served."""
+        self._server.server_close()
+
     def close(self) -> None:
         """Stop, from another thread than the one that serves."""
         self._server.shutdown()
@@ -179,14 +183,21 @@ def view(
     wait_s   how long to wait for a run in the folder before FolderBusy
     """
     asset = Asset.made(Path(folder))
-    with reading(asset.folder, wait_s=wait_s):
-        data = page_data(asset, options or ReportOptions())
+    data: dict[str, Any] = {}
 
     def document(review: str) -> str:
         # Verdicts may have been saved since.
         return page({**data, **reviewed(asset)}, served=review)
 
+    # First, for the address may be taken, and the page takes long; until it is served who asks
+    # waits.
     server = PageServer(asset, document, port)
+    try:
+        with reading(asset.folder, wait_s=wait_s):
+            data |= page_data(asset, options or ReportOptions())
+    except BaseException:
+        server.release()
+        raise
     say(f"{server.address}: open until you interrupt (Ctrl-C)")
     if browser:
         webbrowser.open(server.address)

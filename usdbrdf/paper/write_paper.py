@@ -27,6 +27,7 @@ from usdbrdf.model.camera import Camera
 from usdbrdf.paper import figures, tables
 from usdbrdf.paper.options import PaperOptions
 from usdbrdf.paper.text import paper_text
+from usdbrdf.transport.denoise import chosen_filter
 from usdbrdf.transport.rays import RayScene
 
 DOCUMENT = "paper.json"
@@ -37,11 +38,12 @@ _CAMERAS = 3
 
 @dataclass(frozen=True, kw_only=True)
 class _Side:
-    """One of the two assets, and of which views it is asked."""
+    """One of the two assets, the views that it is asked of, and how it compares with the truth."""
 
     place: Asset
     atlas: AssetMaps
-    document: Path | None
+    views: Views
+    truth: dict[str, Any] | None
 
 
 @reads_asset("first", "second")
@@ -59,11 +61,17 @@ def write_paper(
     chosen = options or PaperOptions()
     place_a, a = measured_atlas(Path(first), chosen.compare.lighting)
     place_b, b = measured_atlas(Path(second), chosen.compare.other_lighting)
-    sides = (
-        _Side(place=place_a.in_lighting(a.lighting or None), atlas=a, document=chosen.views),
-        _Side(place=place_b.in_lighting(b.lighting or None), atlas=b, document=chosen.other_views),
-    )
-    with report.output_folder(Path(output), DOCUMENT, (place_a, place_b)) as work:
+    asked = ((place_a, a, chosen.views), (place_b, b, chosen.other_views))
+    with (
+        report.output_folder(Path(output), DOCUMENT, (place_a, place_b)) as work,
+        scratch_folder() as folder,
+    ):
+        if chosen.relight:
+            chosen_filter(chosen.denoise)
+        # What may be refused is read before the first figure is made.
+        sides = [
+            _side(*each, chosen, folder / name) for name, each in zip(NAMES, asked, strict=True)
+        ]
         with environment_failures(str(work)):
             (work / "tables").mkdir()
             (work / "figures").mkdir()
@@ -103,26 +111,34 @@ def _write_agreement(work: Path, found: dict[str, Any], pair: tuple[Relit, Relit
         write_preview_png(work / f"figures/{name}.png", sheet)
 
 
+def _side(
+    place: Asset, atlas: AssetMaps, document: Path | None, options: PaperOptions, folder: Path
+) -> _Side:
+    """folder: for frames of lenses"""
+    own, how = place.in_lighting(atlas.lighting or None), options.evaluate
+    atlas.environment(how.environment)  # which may be refused
+    truth = None
+    if how.truth is not None:
+        albedo = "base_color" if atlas.has("base_color") else "albedo"
+        truth = metrics.compare_with_truth(atlas, how.truth, how.mesh, albedo)
+    folder.mkdir()
+    views = _views(own, atlas, document, options, folder)
+    return _Side(place=own, atlas=atlas, views=views, truth=truth)
+
+
 def _score(work: Path, name: str, side: _Side, options: PaperOptions) -> dict[str, Any]:
     """Figures 8 and 9 of one asset, their table, and what they come to."""
-    with scratch_folder() as folder:
-        views = _views(side, options, folder)
-        found = viewed_asset(side.place, side.atlas, options.evaluate.environment)
-        shown = figures.TellingViews()
-        rows = []
-        for view in scored_views(found, views, exposure_of_views(views.frames), options.evaluate):
-            rows.append(view.row)
-            shown.see(view)
+    found = viewed_asset(side.place, side.atlas, options.evaluate.environment)
+    shown, rows, exposure = figures.TellingViews(), [], exposure_of_views(side.views.frames)
+    for view in scored_views(found, side.views, exposure, options.evaluate):
+        rows.append(view.row)
+        shown.see(view)
     report.write_table(work / f"tables/views_{name}.csv", rows)
     for suffix in ("png", "svg"):
         report.write_plot(work / f"figures/fig8_{name}.{suffix}", rows)
     write_preview_png(work / f"figures/fig9_{name}.png", figures.views_sheet(shown.chosen()))
-    how, known = options.evaluate, {}
-    if how.truth is not None:
-        albedo = "base_color" if side.atlas.has("base_color") else "albedo"
-        known = {"truth": metrics.compare_with_truth(side.atlas, how.truth, how.mesh, albedo)}
     return {
-        **known,
+        **({} if side.truth is None else {"truth": side.truth}),
         "summary": report.summary_of_views(rows),
         "changes": tables.changes(rows),
         "shown": [view.row["view"] for view in shown.chosen()],
@@ -130,15 +146,16 @@ def _score(work: Path, name: str, side: _Side, options: PaperOptions) -> dict[st
     }
 
 
-def _views(side: _Side, options: PaperOptions, folder: Path) -> Views:
+def _views(
+    place: Asset, atlas: AssetMaps, document: Path | None, options: PaperOptions, folder: Path
+) -> Views:
     """Those of the document that was named, which may need ``folder`` for frames of lenses, else
     the capture's frames, spread evenly."""
-    if side.document is not None:
+    if document is not None:
         return photographs_of_views(
-            side.document, side.place, side.atlas.stage, side.atlas.scene, folder,
-            options.evaluate.allow_outside,
-        )  # fmt: skip
-    frames = side.atlas.frames
+            document, place, atlas.stage, atlas.scene, folder, options.evaluate.allow_outside
+        )
+    frames = atlas.frames
     taken = spread_evenly(len(frames), options.frames)
     return Views(names=tuple(frames.image_paths[i].name for i in taken), frames=frames.at(taken))
 

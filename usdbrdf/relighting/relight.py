@@ -14,13 +14,14 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import not_run, open_edited, recorded_photographs, steps_to_come
 from usdbrdf.asset.readers.render_scene import (
     eye_height,
+    metres_per_unit,
     render_scene_from_stage,
     time_code,
     view_from_stage,
 )
 from usdbrdf.asset.readers.views import cameras_of_views
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
-from usdbrdf.files.atomic import environment_failures, temporary_folder
+from usdbrdf.files.atomic import environment_failures, refuse_unwritable, temporary_folder
 from usdbrdf.files.colour import display_exposure, to_display_srgb8
 from usdbrdf.files.images import read_radiance, write_exr, write_preview_png
 from usdbrdf.job.ownership import reads_asset
@@ -54,11 +55,11 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
         measures = "it measures" if len(missing) == 1 else "they measure"
         warn(f"{asset.folder}: {not_run(missing)}; the picture lacks what {measures}.")
     time = time_code(stage, options.frame)
-    captured = render_scene_from_stage(stage, time, warn)
+    # What may be refused is read before all meshes and pictures are.
     if options.views is None:
         views: tuple[Camera, ...] = (view_from_stage(stage, options.camera, time),)
     else:
-        views = cameras_of_views(options.views, asset, captured.metres_per_unit)
+        views = cameras_of_views(options.views, asset, metres_per_unit(stage))
     if options.width is not None:
         views = tuple(view.at_width(options.width) for view in views)
     targets, is_scene = [output], output.suffix.lower() == SUFFIX
@@ -67,6 +68,8 @@ def relight(folder: Path, output: Path, options: RelightOptions | None = None) -
         for target in targets:
             _refuse_taken(target, folder=False)
     _refuse_inputs(targets, asset, options)
+    refuse_unwritable(targets[0])
+    captured = render_scene_from_stage(stage, time, warn)
     falls = any(insert.falls_from_eye_height for insert in options.inserts)
     scene = relit_scene(captured, options, eye_height(stage) if falls else 0.0)
     told = {

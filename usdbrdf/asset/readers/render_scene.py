@@ -47,8 +47,12 @@ def render_scene_from_stage(
         surfaces=surfaces_from_stage(stage, time, warn),
         lights=_lights_from_stage(stage, time, warn),
         up_axis=str(UsdGeom.GetStageUpAxis(stage)),
-        metres_per_unit=float(UsdGeom.GetStageMetersPerUnit(stage)),
+        metres_per_unit=metres_per_unit(stage),
     )
+
+
+def metres_per_unit(stage: Usd.Stage) -> float:
+    return float(UsdGeom.GetStageMetersPerUnit(stage))
 
 
 def render_scene_from_file(file: Path, warn: Callable[[str], None]) -> RenderScene:

@@ -236,6 +236,7 @@
     $('filter').addEventListener('submit', (event) => event.preventDefault());
     $('save').addEventListener('click', save);
     addEventListener('beforeunload', (event) => { if (unsaved) event.preventDefault(); });
+    gone();
     sort(2);
     filter();
   }
@@ -435,12 +436,41 @@
     return form;
   }
 
+  const there = new Set(data.objects.map((one) => one.prim));
+  const strangers = () => [...review].filter(([prim, now]) =>
+    !there.has(prim) && (now.verdict || now.comment || now.directive));
+
+  /* What was said of objects that were taken out of the capture since: no row has it. */
+  function gone() {
+    const left = strangers();
+    if (!left.length) return;
+    const items = left.map(([prim, now]) => {
+      const told = [now.verdict, now.directive && `for the next run ${now.directive}`, now.comment];
+      const takeBack = el('button', {
+        type: 'button', 'aria-label': `Take back what was said of ${prim}`,
+        onclick: () => {
+          const nothing = { verdict: '', comment: '', directive: '' };
+          review.set(prim, nothing);
+          said.set(prim, nothing);
+          unsaved = true;
+          $('saved').textContent = 'not saved yet';
+          takeBack.replaceWith('taken back');
+        },
+      }, 'Take back');
+      return el('li', {}, el('code', {}, prim), `: ${told.filter(Boolean).join('; ')} `, takeBack);
+    });
+    $('gone').append(
+      el('h3', {}, 'Said of what is no object here'),
+      el('p', { class: 'soft' }, 'It was judged once, and the capture has it no more. Runs pass it over.'),
+      el('ul', {}, ...items));
+  }
+
   const escaped = (text) => text.replace(/\\/g, '\\\\').replace(/"/g, '\\"').replace(/\r/g, '').replace(/\n/g, '\\n');
 
   /* The verdicts as the layer review.usda, as usdbrdf itself writes it. */
   function layer() {
     const tree = {};
-    for (const one of data.objects) {
+    for (const one of [...data.objects, ...strangers().map(([prim]) => ({ prim }))]) {
       const now = judged(one.prim), { verdict, comment, directive } = now;
       if (!(verdict || comment || directive)) continue;
       const { status, phi, psi } = 'status' in now ? now : { ...one, status: one.fit };
