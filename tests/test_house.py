@@ -309,6 +309,7 @@ ENGINEERING: dict[str, str] = {
     "_MAX_TAPS": "time",
     "_MIDDLE": "codes of 8-bit images",
     "_MIN_BASELINE": "limit of what is refused",
+    "_MIN_FRAMES": "limit of what is said",
     "_MIN_FRAMED_SHARE": "limit of what is refused",
     "_MIN_HIT_SHARE": "limit of what is refused",
     "_MIN_SPREAD": "geometry: cameras that do not stand in one place",
