@@ -161,6 +161,7 @@ ENGINEERING: dict[str, str] = {
     "CLOSELY": "time",
     "DARK": "codes of what a texel shows in a frame",
     "DARK_CODE": "codes of 8-bit images",
+    "FINEST": "pixels of a picture",
     "FIRST_RAYS": "rays: noise against time",
     "GLIMPSE": "codes of what a texel shows in a frame",
     "GRID": "discretisation of the search",

@@ -102,11 +102,12 @@ def test_pictures_that_show_nothing_say_nothing(study):
 
 
 def test_what_chance_does_is_not_told():
-    sure = LensCheck(Pattern(zoom=-0.1), moved=0.04, error=0.001, better=16, frames=16)
+    sure = LensCheck(Pattern(zoom=-0.1), moved=0.04, error=0.001, better=16, frames=16, left=0.5)
     assert sure.is_clear
     assert not replace(sure, error=0.02).is_clear
     assert not replace(sure, moved=0.009).is_clear
     assert not replace(sure, better=12).is_clear
+    assert not replace(sure, left=0.9).is_clear
 
 
 @pytest.mark.fault("C18")

@@ -29,6 +29,7 @@ from usdbrdf.transport.rays import RayScene
 _TOLD = calibration.number("lens_check.told")
 _SURE = calibration.number("lens_check.sure")
 _SIGNS = calibration.number("lens_check.signs")
+_LEFT = calibration.number("lens_check.left")
 _OUTLYING = calibration.number("lens_check.outlying")
 # Focal lengths from which is started, as told being 1.
 _STARTS = (1.0, 0.62, 0.71, 0.8, 0.89, 1.12, 1.25, 1.4, 1.6)
@@ -64,21 +65,23 @@ class Pattern:
 @dataclass(frozen=True)
 class LensCheck:
     """The pattern under which N frames agree best; how far it moves the content of a picture, as
-    the root of the mean square over it, and that number's standard error, in pictures' widths; and
-    how many frames agree better with the others then."""
+    the root of the mean square over it, and that number's standard error, in pictures' widths; how
+    many frames agree better with the others then; and the share that is left of what they differ by
+    in all."""
 
     pattern: Pattern
     moved: float
     error: float
     better: int
     frames: int
+    left: float
 
     @property
     def is_clear(self) -> bool:
         """Whether it is worth telling, and nothing that chance does."""
         signs = 2 * self.better - self.frames
         far = self.moved > max(_TOLD, _SURE * self.error)
-        return far and signs > _SIGNS * math.sqrt(self.frames)
+        return far and signs > _SIGNS * math.sqrt(self.frames) and self.left < _LEFT
 
 
 @dataclass(frozen=True)
@@ -126,12 +129,12 @@ def lens_of_frames(
             if np.abs(step).max() < _ENOUGH:
                 break
     told, best = shown(-1, Pattern()), shown(-1, found)
-    better, frames = _better(told, best, len(cameras))
+    better, compared, left = _better(told, best, len(cameras))
     form = _form(pictures[0].shape[1] / pictures[0].shape[0])
     numbers = np.array([math.expm1(found.zoom), found.bend, found.right, found.down])
     moved = math.sqrt(float(numbers @ form @ numbers))
     error = math.sqrt(float(np.trace(form @ covariance)))
-    return LensCheck(found, moved, error, better, frames)
+    return LensCheck(found, moved, error, better, compared, left)
 
 
 def _no_wider(picture: Float, width: int) -> Float:
@@ -243,9 +246,9 @@ def _step(samples: _Samples) -> tuple[Double, Double]:
     return np.asarray(step, np.float64), np.asarray(covariance, np.float64)
 
 
-def _better(told: _Samples, best: _Samples, frames: int) -> tuple[int, int]:
+def _better(told: _Samples, best: _Samples, frames: int) -> tuple[int, int, float]:
     """How many frames agree better with the others under another pattern, at the points that they
-    show under both, and how many were compared."""
+    show under both; how many were compared; and the share that is left of what they differ by."""
     sides = []
     for samples in (told, best):
         off: Double = np.full((int(samples.point.max()) + 1, frames), np.nan)
@@ -255,7 +258,9 @@ def _better(told: _Samples, best: _Samples, frames: int) -> tuple[int, int]:
     change = sides[1][:rows] - sides[0][:rows]
     compared = np.asarray(np.isfinite(change).any(axis=0), np.bool_)
     means = np.nansum(change, axis=0)[compared]
-    return int((means < 0).sum()), int(compared.sum())
+    before = float(sides[0][:rows][np.isfinite(change)].sum())
+    left = 1 + float(np.nansum(change)) / max(before, 1e-9)
+    return int((means < 0).sum()), int(compared.sum()), left
 
 
 def doubts_about_lens(found: LensCheck | None, source: Path) -> Iterator[str]:
