@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 
+from tests.scenes import make_capture
 from tests.validation.faults import edited
 from usdbrdf.asset.header import Provenance, new_layer, refuse_old_layout
+from usdbrdf.asset.layers import interface
 from usdbrdf.asset.layers.interface import components_of, write_interface
 from usdbrdf.asset.layers.task_layers import write_material_layer
 from usdbrdf.asset.layout import ROLES
@@ -364,3 +366,20 @@ def test_who_renames_in_the_edits_is_told_where_that_goes(built):
     shot.GetRootLayer().relocates = [("/set/geo/lamp", "/set/geo/lantern")]
     assert shot.GetPrimAtPath("/set/geo/lantern/lamp").IsA(UsdGeom.Mesh)
     assert not shot.GetCompositionErrors()
+
+
+def test_the_layer_that_all_objects_refer_to_is_read_once(tmp_path, monkeypatch):
+    # Read anew for each it takes a time that grows as the square of their number.
+    held = []
+    write = interface.export
+
+    def export(layer, path, *, folder):
+        if layer.customLayerData["usdbrdf"]["role"] == "component":
+            loaded = {Sdf.Layer.GetDisplayName(one) for one in Sdf.Layer.GetLoadedLayers()}
+            held.append("scan.interface.usda" in loaded)
+        write(layer, path, folder=folder)
+
+    monkeypatch.setattr(interface, "export", export)
+    room = make_capture(tmp_path / "room")
+    assert main(["ingest", str(room.folder), "-o", str(tmp_path / "out")]) == 0
+    assert held == [True] * len(room.names)

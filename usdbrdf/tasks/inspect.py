@@ -18,6 +18,7 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.agreement import ASKED, agreement_of_frames
 from usdbrdf.tasks.capture_inputs import no_asset
+from usdbrdf.tasks.lens import asked_of_its_lens
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
 from usdbrdf.tasks.turned import frames_to_compare, refuse_turned
 from usdbrdf.texturing.agreement import doubts_about_agreement, surface_and_rays
@@ -54,7 +55,9 @@ def inspect(
             agrees, shown = agreement_of_frames(surface, rays, frames, read, capture)
             names = [path.name for path in frames.image_paths]
             doubts = [*doubts_about_agreement(agrees, capture)]
-            doubts += doubts_about_places(frames_astray(shown), names, capture)
+            astray = frames_astray(shown)
+            doubts += doubts_about_places(astray, names, capture)
+            doubts += asked_of_its_lens(mesh, rays, frames, read, capture, astray)
             objects = found.objects
             if options.objects == AUTO:
                 frames = developed_frames(frames_that_tell_colours(mesh, len(every)), folder)

@@ -18,6 +18,7 @@ from usdbrdf.model.capture import Scan
 from usdbrdf.model.upright import as_captured, upright
 from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.tasks.agreement import agreement_of_frames
+from usdbrdf.tasks.lens import asked_of_its_lens
 from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.optics import asked_of_its_optics
 from usdbrdf.tasks.poses import with_refined_poses
@@ -29,6 +30,7 @@ from usdbrdf.texturing.agreement import (
     logarithms_in_frame,
     surface_and_rays,
 )
+from usdbrdf.texturing.astray import frames_astray
 from usdbrdf.texturing.exposures import doubts_about_exposures, with_estimated_exposures
 from usdbrdf.transport.rays import RayScene
 
@@ -42,8 +44,10 @@ def asked_of_its_pixels(
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     surface, rays = surface_and_rays(scan.mesh)
     refuse_turned(surface, rays, scan.frames, scan.turned_images, read, scan.source)
-    agrees, _ = agreement_of_frames(surface, rays, scan.frames, read, scan.source)
+    agrees, shown = agreement_of_frames(surface, rays, scan.frames, read, scan.source)
     warnings = warned(doubts_about_agreement(agrees, scan.source))
+    astray = frames_astray(shown)
+    warnings += warned(asked_of_its_lens(scan.mesh, rays, scan.frames, read, scan.source, astray))
     estimate = options.vignetting == "estimate"
     scan, told, doubts = asked_of_its_optics(scan, surface, rays, read, estimate=estimate)
     warnings += warned(doubts)
