@@ -11,7 +11,9 @@ import pytest
 from usdbrdf.shading.shaded import Shaded, _doubt
 
 
-def _shaded(*, emits=False, outside=None, error=0.01, over_one=0.0, escaped=0.0) -> Shaded:
+def _shaded(
+    *, emits=False, outside=None, error=0.01, over_one=0.0, escaped=0.0, albedo=0.5
+) -> Shaded:
     """Of one object that reflects, and as much of the light as the sentences speak of."""
     nothing = SimpleNamespace()
     return Shaded(
@@ -21,8 +23,10 @@ def _shaded(*, emits=False, outside=None, error=0.01, over_one=0.0, escaped=0.0)
         traced=SimpleNamespace(escaped=np.full(4, escaped)),
         relative_error=np.array([0, error, error, 1], np.float32),
         irradiance=np.ones((4, 3), np.float32),
-        emitters=SimpleNamespace(emissive=np.full(4, emits), lower_bound=np.zeros(1, np.bool_)),
-        albedo=np.ones((4, 3), np.float32),
+        emitters=SimpleNamespace(
+            emissive=np.array([emits, False, False, False]), lower_bound=np.zeros(1, np.bool_)
+        ),
+        albedo=np.full((4, 3), albedo, np.float32),
         unexplained=np.zeros(4, np.bool_),
         over_one=over_one,
         outside=outside,
@@ -44,6 +48,9 @@ def test_good_light_leaves_no_doubt():
             {"emits": True, "escaped": 0.6}, "open", "60 %", marks=pytest.mark.fault("G13")
         ),
         pytest.param({"emits": True, "error": 0.3}, "noise", "30 %", marks=pytest.mark.fault("L7")),
+        pytest.param(
+            {"emits": True, "albedo": 0.02}, "dark", "0.02", marks=pytest.mark.fault("L8")
+        ),
     ],
 )
 def test_each_doubt_is_told_and_no_other(found, rule, word):
@@ -52,7 +59,9 @@ def test_each_doubt_is_told_and_no_other(found, rule, word):
     assert word in doubt
 
 
-@pytest.mark.parametrize("found", [{"over_one": 0.05}, {"escaped": 0.5}, {"error": 0.19}], ids=str)
+@pytest.mark.parametrize(
+    "found", [{"over_one": 0.05}, {"escaped": 0.5}, {"error": 0.19}, {"albedo": 0.031}], ids=str
+)
 def test_at_the_limit_there_is_none(found):
     assert list(_shaded(emits=True, **found).doubts(["box"])) == []
 

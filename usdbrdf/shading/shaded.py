@@ -211,8 +211,9 @@ def denoised_irradiance(texels: Texels, irradiance: Float) -> Float:
 
 
 # What is worth a warning: shares of the known texels with an albedo over 1, and of light's
-# directions that leave the scan; the relative standard error of S.
-_MANY_OVER_ONE, _MOSTLY_OPEN, _NOISY = 0.05, 0.5, 0.2
+# directions that leave the scan; the relative standard error of S; an albedo of coal, which half
+# of what reflects has where pixels were decoded twice.
+_MANY_OVER_ONE, _MOSTLY_OPEN, _NOISY, _COAL = 0.05, 0.5, 0.2, 0.03
 
 
 @dataclass(frozen=True)
@@ -306,6 +307,14 @@ class Shaded:
                 f"{100 * self.over_one:.0f} % of the seen texels have an albedo over 1 and were "
                 "clamped. Check the exposures, or give the missing light as --environment. "
                 "[shading.albedo]"
+            )
+        reflects = self.albedo[self.measured & ~self.emitters.emissive]
+        middle = float(np.median(reflects)) if len(reflects) else math.nan
+        if middle < _COAL:
+            yield (
+                f"half of what the frames show has an albedo under {middle:.2g}, as coal has. "
+                "Check that the pixels are linear and were not decoded twice, and the exposures. "
+                "[shading.dark]"
             )
         escaped = float(self.traced.escaped.mean())
         if escaped > _MOSTLY_OPEN and not self.outside:
