@@ -298,6 +298,7 @@ ENGINEERING: dict[str, str] = {
     "_LOOKS_AT_MIRRORED": "steps of a search",
     "_MANY": "time: how many are asked",
     "_MANY_FRAMES": "rays: noise against time",
+    "_LEAST_SIDE": "rows and columns of the smallest picture",
     "_COAL": "from here down a warning is printed",
     "_MANY_OVER_ONE": "from here on a warning is printed",
     "_MANY_PER_SEGMENT": "time: how many are chosen from",

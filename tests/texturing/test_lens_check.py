@@ -90,6 +90,28 @@ def test_distortion_that_is_not_told_is_found(study):
     assert -0.11 < found.pattern.bend < -0.06
 
 
+@pytest.mark.parametrize("noise", [0.1, 0.3])
+def test_noisy_frames_from_nearly_one_place_do_not_tell_of_a_lens(study, noise):
+    """Under any lens that magnifies them they have less noise, and agree better by that alone."""
+    mesh, rays, cameras, pictures = study
+    random = np.random.default_rng(5)
+    near, noisy = [], []
+    for _ in range(16):
+        pose = cameras[0].world_from_camera.copy()
+        pose[:3, 3] += random.uniform(-0.01, 0.01, 3)
+        near.append(replace(cameras[0], world_from_camera=pose))
+        dark = np.log1p(noise * random.normal(size=pictures[0].shape).clip(-2, 2))
+        noisy.append((pictures[0] + dark).astype(np.float32))
+    found = lens_of_frames(mesh, rays, near, noisy)
+    assert found is None or not found.is_clear
+
+
+def test_strips_say_nothing(study):
+    mesh, rays, cameras, _ = study
+    strips = [np.zeros((4, 700), np.float32)] * len(cameras)
+    assert lens_of_frames(mesh, rays, cameras, strips) is None
+
+
 def test_few_frames_say_nothing(study):
     mesh, rays, cameras, pictures = study
     assert lens_of_frames(mesh, rays, cameras[:5], pictures[:5]) is None
@@ -102,12 +124,15 @@ def test_pictures_that_show_nothing_say_nothing(study):
 
 
 def test_what_chance_does_is_not_told():
-    sure = LensCheck(Pattern(zoom=-0.1), moved=0.04, error=0.001, better=16, frames=16, left=0.5)
+    sure = LensCheck(
+        Pattern(zoom=-0.1), moved=0.04, error=0.001, better=16, frames=16, left=0.5, apart=0.5
+    )
     assert sure.is_clear
     assert not replace(sure, error=0.02).is_clear
     assert not replace(sure, moved=0.009).is_clear
     assert not replace(sure, better=12).is_clear
     assert not replace(sure, left=0.9).is_clear
+    assert not replace(sure, apart=0.05).is_clear
 
 
 @pytest.mark.fault("C18")

@@ -117,11 +117,12 @@ def folders_above(file: Path) -> Iterator[None]:
 
 
 def refuse_unwritable(file: Path) -> None:
-    """EnvironmentFailure, before the work for it, where no file of this name could be written."""
+    """EnvironmentFailure, before the work for it, where no file of this name could be written. No
+    folder is made for that: it would have to go again, maybe under the feet of another command."""
+    above = next(folder for folder in file.parents if folder.exists())
     with (
         environment_failures(str(file)),
-        folders_above(file),
-        temporary_beside(file) as staged,
+        temporary_beside(above / file.name) as staged,
         naming(file),
     ):
         staged.touch()

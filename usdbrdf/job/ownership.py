@@ -281,18 +281,21 @@ _RECORD = "job.json"
 _WRITTEN = ("layers", "textures")
 
 
-def refuse_newer_state(state: Path) -> None:
+def refuse_newer_state(state: Path) -> bool:
     """InputRefused where a newer version made the asset of this state folder: what it means by
-    what lies there this one cannot know."""
-    record, schema = state / _RECORD, None
-    with suppress(InputRefused):  # absent or damaged: it only says whose folder this is
+    what lies there this one cannot know. Whether its record is there and sound."""
+    record = state / _RECORD
+    try:
         document = read_json(record)
-        schema = document.get("schema") if isinstance(document, dict) else None
+    except InputRefused:  # it only says whose folder this is
+        return False
+    schema = document.get("schema") if isinstance(document, dict) else None
     if isinstance(schema, int) and schema > JOB_SCHEMA:
         raise InputRefused(
             f"{record}: written by a newer usdbrdf (schema {schema}, this one knows {JOB_SCHEMA}). "
             "Install that version, or convert the capture into a new folder. [asset.newer]"
         )
+    return True
 
 
 @contextmanager
@@ -322,10 +325,7 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
             held.enter_context(_removed_if_unused(asset, made))
             record, folders = state / _RECORD, ("stamps", "work", "cache")
             refuse_misplaced(asset, [record], [state / name for name in folders])
-            refuse_newer_state(state)
-            try:
-                read_json(record)
-            except InputRefused:  # absent or damaged: it only says whose folder this is
+            if not refuse_newer_state(state):
                 write_json(record, {"schema": JOB_SCHEMA, "tool": "usdbrdf"})
                 # Files of ours that a power cut spares would be nobody's without it.
                 for folder in (state, *made):

@@ -13,13 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from usdbrdf import calibration
-from usdbrdf.model.arrays import Double, Float, Long
+from usdbrdf.geometry.visible_faces import visible_faces
+from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.texturing.agreement import MeshPoints, points_of_surface
@@ -30,11 +32,14 @@ _TOLD = calibration.number("lens_check.told")
 _SURE = calibration.number("lens_check.sure")
 _SIGNS = calibration.number("lens_check.signs")
 _LEFT = calibration.number("lens_check.left")
+_APART = calibration.number("lens_check.apart")
 _OUTLYING = calibration.number("lens_check.outlying")
 # Focal lengths from which is started, as told being 1.
 _STARTS = (1.0, 0.62, 0.71, 0.8, 0.89, 1.12, 1.25, 1.4, 1.6)
 # Pixels of a picture's width: of the smallest, in which is started, and of the largest.
 _COARSEST, FINEST = 64, 256
+# And rows and columns that one has at least.
+_LEAST_SIDE = 8
 # Points of the mesh; patches across a picture; samples and frames without which nothing is said.
 _POINTS, _ACROSS, _FEWEST, _MIN_FRAMES = 1 << 14, 8, 500, 6
 _ROUNDS, _TURNS = 3, 4
@@ -70,8 +75,11 @@ class Pattern:
 class LensCheck:
     """The pattern under which N frames agree best; how far it moves the content of a picture, as
     the root of the mean square over it, and that number's standard error, in pictures' widths; how
-    many frames agree better with the others then; and the share that is left of what they differ by
-    in all."""
+    many frames agree better with the others then; the share that is left of what they differ by in
+    all; and apart, how differently frames move on the surface what they show of one point, beside
+    how far they do, as roots of mean squares: next to nothing for frames from one place, which
+    would agree under any lens, and better under one that magnifies: by that they have less
+    noise."""
 
     pattern: Pattern
     moved: float
@@ -79,25 +87,31 @@ class LensCheck:
     better: int
     frames: int
     left: float
+    apart: float
 
     @property
     def is_clear(self) -> bool:
         """Whether it is worth telling, and nothing that chance does."""
         signs = 2 * self.better - self.frames
         far = self.moved > max(_TOLD, _SURE * self.error)
-        return far and signs > _SIGNS * math.sqrt(self.frames) and self.left < _LEFT
+        agree = signs > _SIGNS * math.sqrt(self.frames) and self.left < _LEFT
+        return far and agree and self.apart > _APART
 
 
 @dataclass(frozen=True)
 class _Samples:
     """S samples of all frames, in turn: point, frame and patch (each (S,), patches numbered
-    through), value (S,) and slopes (S, 4) by the numbers of a pattern."""
+    through), value (S,), slopes (S, 4) by the numbers of a pattern, place (S, 2) in the picture, in
+    half diagonals from the principal point, and what half a diagonal to the right and down is at
+    the point, (S, 2, 3)."""
 
     point: Long
     frame: Long
     patch: Long
     value: Double
     slope: Double
+    place: Double
+    sides: Double
 
 
 def lens_of_frames(
@@ -110,12 +124,21 @@ def lens_of_frames(
     if len(cameras) < _MIN_FRAMES:
         return None
     surface = points_of_surface(mesh, _POINTS)
+    if min(min(picture.shape) for picture in pictures) < _LEAST_SIDE:
+        return None
     sizes = [[_no_wider(picture, FINEST) for picture in pictures]]
-    while min(picture.shape[1] for picture in sizes[0]) >= 2 * _COARSEST:
+    while _may_be_halved(sizes[0], 2 * _COARSEST):
         sizes.insert(0, [halved(picture) for picture in sizes[0]])
 
+    @cache
+    def visible(level: int) -> list[tuple[Int, Float]]:
+        return [
+            visible_faces(rays, camera.at_size(picture.shape[1], picture.shape[0]))
+            for camera, picture in zip(cameras, sizes[level], strict=True)
+        ]
+
     def shown(level: int, pattern: Pattern) -> _Samples:
-        return _shown(surface, rays, cameras, sizes[level], pattern)
+        return _shown(surface, cameras, sizes[level], visible(level), pattern)
 
     begun = {zoom: shown(0, Pattern(math.log(zoom))) for zoom in _STARTS}
     most = max(len(samples.point) for samples in begun.values())
@@ -135,7 +158,7 @@ def lens_of_frames(
                 return None
             if np.abs(step).max() < _ENOUGH:
                 break
-    told, best = shown(-1, Pattern()), shown(-1, found)
+    told, best = (shown(len(sizes) - 1, pattern) for pattern in (Pattern(), found))
     if min(len(told.point), len(best.point)) < _FEWEST:
         return None
     better, compared, left = _better(told, best, len(cameras))
@@ -143,13 +166,27 @@ def lens_of_frames(
     numbers = np.array([math.expm1(found.zoom), found.bend, found.right, found.down])
     moved = math.sqrt(float(numbers @ form @ numbers))
     error = math.sqrt(float(np.trace(form @ covariance)))
-    return LensCheck(found, moved, error, better, compared, left)
+    return LensCheck(found, moved, error, better, compared, left, _apart(told, found))
+
+
+def _apart(samples: _Samples, pattern: Pattern) -> float:
+    """As of ``LensCheck``."""
+    shift = np.stack(pattern.place(*samples.place.T), axis=1) - samples.place
+    moved = np.einsum("sk,ski->is", shift, samples.sides)
+    point, count = samples.point, np.bincount(samples.point)
+    means = [(np.bincount(point, one) / np.maximum(count, 1))[point] for one in moved]
+    return math.sqrt(float(((moved - means) ** 2).sum()) / max(float((moved**2).sum()), 1e-30))
 
 
 def _no_wider(picture: Float, width: int) -> Float:
-    while picture.shape[1] >= 2 * width:
+    while _may_be_halved([picture], 2 * width):
         picture = halved(picture)
     return picture
+
+
+def _may_be_halved(pictures: Sequence[Float], width: int) -> bool:
+    """Whether all are so wide at least, and high enough."""
+    return all(p.shape[1] >= width and p.shape[0] >= 2 * _LEAST_SIDE for p in pictures)
 
 
 def _form(aspect: float) -> Double:
@@ -165,17 +202,18 @@ def _form(aspect: float) -> Double:
 
 
 def _shown(
-    surface: MeshPoints, rays: RayScene, cameras: Sequence[Camera], pictures: Sequence[Float],
-    pattern: Pattern,
+    surface: MeshPoints, cameras: Sequence[Camera], pictures: Sequence[Float],
+    visible: Sequence[tuple[Int, Float]], pattern: Pattern,
 ) -> _Samples:  # fmt: skip
-    """What the frames show of the points, if ``pattern`` is so."""
+    """What the frames show of the points, if ``pattern`` is so, where faces are ``visible``."""
     columns, patches = [], 0
     for i, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
         height, width = picture.shape
         camera = camera.at_size(width, height)
         half = math.hypot(width, height) / 2
         patch = max(1, width // _ACROSS)
-        seen = look_up(surface, rays, camera, _moved(picture, camera, pattern, half), patch)
+        moved = _moved(picture, camera, pattern, half)
+        seen = look_up(surface, visible[i], camera, moved, patch)
         m = np.linalg.inv(camera.world_from_camera)
         z = surface.point[seen.point] @ m[2, :3] + m[2, 3]
         x, y = ((camera.project(surface.point[seen.point]) - camera.intrinsics[2:]) / half).T
@@ -187,12 +225,15 @@ def _shown(
         )
         slope = np.stack([zoom, zoom * (x**2 + y**2), right, down], axis=1)
         frame = np.full(len(seen.point), i)
-        columns.append((seen.point, frame, seen.patch + patches, seen.value, slope))
+        place = np.stack([x, y], axis=1)
+        across = camera.world_from_camera[:3, :2].T * [[half / fx], [-half / fy]]
+        sides = -z[:, None, None] * across
+        columns.append((seen.point, frame, seen.patch + patches, seen.value, slope, place, sides))
         patches += int(seen.patch.max(initial=-1)) + 1
-    point, frame, patch, value, slope = (np.concatenate(c) for c in zip(*columns, strict=True))
+    point, frame, patch, value, *rest = (np.concatenate(c) for c in zip(*columns, strict=True))
     known = np.bincount(point, minlength=len(surface.point))[point] > 1
-    value = value.astype(np.float64)
-    return _Samples(point[known], frame[known], patch[known], value[known], slope[known])
+    of_all = point, frame, patch, value.astype(np.float64), *rest
+    return _Samples(*(column[known] for column in of_all))
 
 
 def _moved(picture: Float, camera: Camera, pattern: Pattern, half: float) -> Float:
@@ -230,8 +271,7 @@ def _disagreement(samples: _Samples) -> float:
     patch = samples.patch
     count = np.bincount(patch)
     inside = samples.value - (np.bincount(patch, samples.value) / np.maximum(count, 1))[patch]
-    variety = float(np.abs(inside).mean())
-    return float(np.abs(_off(samples)).mean()) / max(variety, 1e-9)
+    return float(np.abs(_off(samples)).mean()) / max(float(np.abs(inside).mean()), 1e-9)
 
 
 def _step(samples: _Samples) -> tuple[Double, Double]:

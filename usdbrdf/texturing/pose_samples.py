@@ -61,13 +61,20 @@ def halved(picture: Float) -> Float:
 
 
 def look_up(
-    surface: MeshPoints, rays: RayScene, camera: Camera, picture: Float, patch: int
+    surface: MeshPoints,
+    visible: RayScene | tuple[Int, Float],
+    camera: Camera,
+    picture: Float,
+    patch: int,
 ) -> LookedUp:
     """What a frame shows, whose logarithms are ``picture`` in any size; points beside an edge of
-    what hides others are left out. Patches have ``patch`` pixels to a side."""
+    what hides others are left out. Patches have ``patch`` pixels to a side. visible: the mesh, or
+    what ``visible_faces`` says of it in this size already."""
     height, width = picture.shape
     camera = camera.at_size(width, height)
-    face, seen = visible_faces(rays, camera)
+    if isinstance(visible, RayScene):
+        visible = visible_faces(visible, camera)
+    face, seen = visible
     value = np.full(len(surface.point), np.nan, np.float32)
     slope = np.zeros((len(surface.point), 6), np.float32)
     smooth = np.empty_like(picture)
