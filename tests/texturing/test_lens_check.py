@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.scenes import edited
+from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.cli import main
 from usdbrdf.files.frames import read_frame
@@ -103,6 +103,18 @@ def test_noisy_frames_from_nearly_one_place_do_not_tell_of_a_lens(study, noise):
         dark = np.log1p(noise * random.normal(size=pictures[0].shape).clip(-2, 2))
         noisy.append((pictures[0] + dark).astype(np.float32))
     found = lens_of_frames(mesh, rays, near, noisy)
+    assert found is None or not found.is_clear
+
+
+@pytest.mark.parametrize(("size", "room"), [((32, 24), True), ((128, 96), False)])
+def test_plain_noisy_things_do_not_tell_of_a_lens(tmp_path, size, room):
+    noise = 0.03 if room else 0.05
+    capture = make_capture(tmp_path / "scan", size=size, room=room, noise=noise).folder
+    scan = as_captured(read_scan(capture, IngestOptions()))
+    frames, rays = scan.frames, RayScene(scan.mesh.points, scan.mesh.triangles)
+    pictures = [logarithms(read_frame(frames, i), 1) for i in range(len(frames))]
+    cameras = [frames.camera(i) for i in range(len(frames))]
+    found = lens_of_frames(scan.mesh, rays, cameras, pictures)
     assert found is None or not found.is_clear
 
 

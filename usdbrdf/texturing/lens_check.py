@@ -75,11 +75,10 @@ class Pattern:
 class LensCheck:
     """The pattern under which N frames agree best; how far it moves the content of a picture, as
     the root of the mean square over it, and that number's standard error, in pictures' widths; how
-    many frames agree better with the others then; the share that is left of what they differ by in
-    all; and apart, how differently frames move on the surface what they show of one point, beside
-    how far they do, as roots of mean squares: next to nothing for frames from one place, which
-    would agree under any lens, and better under one that magnifies: by that they have less
-    noise."""
+    many frames agree better with the others then; the share that is left of what they differ by,
+    beside what samples of a patch do; and apart, how differently frames move on the surface what
+    they show of one point, beside how far they do, as roots of mean squares: next to nothing for
+    frames from one place, which would agree under any lens."""
 
     pattern: Pattern
     moved: float
@@ -161,7 +160,9 @@ def lens_of_frames(
     told, best = (shown(len(sizes) - 1, pattern) for pattern in (Pattern(), found))
     if min(len(told.point), len(best.point)) < _FEWEST:
         return None
-    better, compared, left = _better(told, best, len(cameras))
+    better, compared = _better(told, best, len(cameras))
+    # Under a lens that magnifies frames have less noise and less detail: they agree better by that.
+    left = _disagreement(best) / max(_disagreement(told), 1e-9)
     form = _form(pictures[0].shape[1] / pictures[0].shape[0])
     numbers = np.array([math.expm1(found.zoom), found.bend, found.right, found.down])
     moved = math.sqrt(float(numbers @ form @ numbers))
@@ -292,9 +293,9 @@ def _step(samples: _Samples) -> tuple[Double, Double]:
     return np.asarray(step, np.float64), np.asarray(covariance, np.float64)
 
 
-def _better(told: _Samples, best: _Samples, frames: int) -> tuple[int, int, float]:
+def _better(told: _Samples, best: _Samples, frames: int) -> tuple[int, int]:
     """How many frames agree better with the others under another pattern, at the points that they
-    show under both; how many were compared; and the share that is left of what they differ by."""
+    show under both; and how many were compared."""
     sides = []
     for samples in (told, best):
         off: Double = np.full((int(samples.point.max()) + 1, frames), np.nan)
@@ -304,9 +305,7 @@ def _better(told: _Samples, best: _Samples, frames: int) -> tuple[int, int, floa
     change = sides[1][:rows] - sides[0][:rows]
     compared = np.asarray(np.isfinite(change).any(axis=0), np.bool_)
     means = np.nansum(change, axis=0)[compared]
-    before = float(sides[0][:rows][np.isfinite(change)].sum())
-    left = 1 + float(np.nansum(change)) / max(before, 1e-9)
-    return int((means < 0).sum()), int(compared.sum()), left
+    return int((means < 0).sum()), int(compared.sum())
 
 
 def doubts_about_lens(found: LensCheck | None, source: Path) -> Iterator[str]:

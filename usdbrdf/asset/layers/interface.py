@@ -301,7 +301,7 @@ def write_components(
     """The files of the objects, at ``place`` of their paths in the asset: what the root layer has
     of one of them, at the origin."""
     asset = draft.asset
-    kept: set[Sdf.Layer] = set()
+    held: Sdf.Layer | None = None
     for item in components:
         identifier = item.label.identifier
         header = StageHeader(**vars(draft.header) | {"name": identifier})
@@ -313,9 +313,7 @@ def write_components(
         payload = Sdf.Payload(f"../../{asset.root_layer.name}", target)
         prim.payloadList.prependedItems = [payload]
         attribute(prim, "xformOpOrder", Types.TokenArray, [], uniform=True)
-        if not kept:
-            # All of them refer to it, and it tells of all objects: read for each again, the time
-            # would grow as their square.
-            opened = Sdf.Layer.FindOrOpen(os.path.normpath(path.parent / interface))
-            kept |= {opened} - {None}
+        # All of them refer to it, and it tells of all objects: read for each again, the time would
+        # grow as their square.
+        held = held or Sdf.Layer.FindOrOpen(os.path.normpath(path.parent / interface))
         export(layer, path, folder=path.parent)
