@@ -4,7 +4,7 @@
         [--exposure-drift S] [--clip RADIANCE] [--seed N] [--focal F] [--principal SHARE]
         [--shift-poses N] [--keep-every N] [--tenth-stops STOPS] [--auto-exposure]
         [--balance-drift STOPS] [--vignetting STOPS] [--distortion K1] [--encode srgb|linear]
-        [--mesh-scale F] [--mesh-mm X Y Z] [--move-object NAME MM]
+        [--mesh-scale F] [--mesh-mm X Y Z] [--mesh-degrees X Y Z] [--move-object NAME MM]
 
 CAPTURE is a folder with transforms.json, as `samples/study`. Disturbed are, frame by frame:
 
@@ -19,7 +19,8 @@ CAPTURE is a folder with transforms.json, as `samples/study`. Disturbed are, fra
     encoding  pixels as sRGB encodes them, though the frames pass for linear; or its inverse
     lens      focal length times F, principal point off by a share of the width as they are told;
               or the picture as a lens of the radial k1 shows it, which is not told
-    mesh      larger by F about its middle, or moved; or one object of it moved along x
+    mesh      larger by F about its middle, turned about it by a rotation vector, or moved; or one
+              object of it moved along x
 
 The same seed gives the same capture. Files that do not change are hard links where the file system
 allows; the truth stays the truth.
@@ -73,6 +74,9 @@ def main() -> int:
     parser.add_argument("--mesh-scale", type=float, default=1.0, metavar="F")
     parser.add_argument(
         "--mesh-mm", type=float, nargs=3, default=(0, 0, 0), metavar=("X", "Y", "Z")
+    )
+    parser.add_argument(
+        "--mesh-degrees", type=float, nargs=3, default=(0, 0, 0), metavar=("X", "Y", "Z")
     )
     parser.add_argument("--move-object", nargs=2, metavar=("NAME", "MM"))
     options = parser.parse_args()
@@ -199,12 +203,15 @@ ENCODINGS = {"srgb": encoded, "linear": decoded}
 
 
 def disturb_mesh(options: argparse.Namespace, document: dict[str, Any]) -> None:
-    """Write the mesh, larger, moved, or with one object of it elsewhere."""
+    """Write the mesh, larger, turned, moved, or with one object of it elsewhere."""
     source = options.capture / document["mesh"]
     mesh = mesh_from_file(source)
     points = mesh.points.astype(np.float64)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    moved = middle + options.mesh_scale * (points - middle) + np.array(options.mesh_mm) / 1000
+    moved = options.mesh_scale * (points - middle)
+    if any(options.mesh_degrees):
+        moved = Rotation.from_rotvec(np.radians(options.mesh_degrees)).apply(moved)
+    moved = middle + moved + np.array(options.mesh_mm) / 1000
     if options.move_object:
         name, millimetres = options.move_object
         labels = json.loads((options.capture / document["objects"]).read_text())["objects"]

@@ -296,6 +296,7 @@ ENGINEERING: dict[str, str] = {
     "_LOBES": "a filter, measured by benchmarks/lenses.py",
     "_LONGEST": "length of a name",
     "_LONGEST_STEM": "length of a name",
+    "_LONGER": "steps of a search",
     "_LOOKS_AT_DISC": "steps of a search",
     "_LOOKS_AT_MIRRORED": "steps of a search",
     "_MANY": "time: how many are asked",

@@ -621,3 +621,40 @@ def test_a_principal_point_outside_of_the_image_is_told(made):
     with edited(made.manifest) as document:
         document["cx"] = 40.0
     assert any("[capture.camera]" in sentence for sentence in _read(made).warnings)
+
+
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        ("a%20b/r {}.exr", "a b/r {}.exr"),
+        ("a b/r {}.exr", "a%20b/r%20{}.exr"),
+        ("%41 {}", "A {}.exr"),
+    ],
+)
+def test_names_may_be_written_as_in_addresses(made, name, files):
+    _rename(made, name, files=files)
+    scan = _read(made)
+    assert [
+        path.relative_to(made.folder.resolve()).as_posix() for path in scan.frames.image_paths
+    ] == [files.format(i) for i in range(12)]
+
+
+def test_a_name_that_is_there_is_not_read_as_an_address(made):
+    _rename(made, "a%20b {}.exr", files="a%20b {}.exr")
+    _rename(made, "a%20b {}.exr")
+    for i in range(12):
+        shutil.copy(made.folder / f"a%20b {i}.exr", made.folder / f"a b {11 - i}.exr")
+    assert [path.name for path in _read(made).frames.image_paths] == [
+        f"a%20b {i}.exr" for i in range(12)
+    ]
+
+
+@pytest.mark.parametrize(
+    "name", ["%2e%2e/beside {}.exr", "%00 {}.exr", "%2Fetc%2Fpasswd", "\ud800 {}"]
+)
+def test_an_address_leads_no_farther_than_a_name(made, name):
+    for i in range(12):
+        shutil.copy(made.image(i), made.folder.parent / f"beside {i}.exr")
+    _rename(made, name)
+    with pytest.raises(InputRefused):
+        _read(made)

@@ -17,8 +17,9 @@ from usdbrdf.cli import main
 from usdbrdf.files.frames import read_frame
 from usdbrdf.model.upright import as_captured
 from usdbrdf.options import IngestOptions
-from usdbrdf.texturing.lens_check import LensCheck, Pattern, doubts_about_lens, lens_of_frames
 from usdbrdf.texturing.pose_samples import logarithms
+from usdbrdf.texturing.registration.joint_change import Found
+from usdbrdf.texturing.registration.lens import Pattern, lens_of_frames, said_of_lens
 from usdbrdf.transport.rays import RayScene
 
 STUDY = Path(__file__).parents[2] / "samples" / "study"
@@ -48,7 +49,6 @@ def test_the_lens_that_is_told_is_believed_where_it_is_right(study):
     found = _with_lens(study)
     assert found.moved < 0.005
     assert not found.is_clear
-    assert list(doubts_about_lens(found, Path("capture"))) == []
 
 
 @pytest.mark.fault("C18")
@@ -56,11 +56,11 @@ def test_the_lens_that_is_told_is_believed_where_it_is_right(study):
 def test_another_focal_length_is_found(study, longer):
     found = _with_lens(study, longer)
     assert found.is_clear
-    assert math.exp(found.pattern.zoom) * longer == pytest.approx(1, abs=0.015)
-    assert abs(found.pattern.bend) < 0.02
-    (sentence,) = doubts_about_lens(found, Path("capture"))
+    assert math.exp(found.change.zoom) * longer == pytest.approx(1, abs=0.015)
+    assert abs(found.change.bend) < 0.02
+    sentence = said_of_lens(found, Path("capture"))
     assert sentence.endswith("[capture.lens]")
-    assert f"focal length {math.exp(found.pattern.zoom):.3f} times" in sentence
+    assert f"focal length {math.exp(found.change.zoom):.3f} times" in sentence
 
 
 @pytest.mark.fault("C18")
@@ -68,8 +68,8 @@ def test_another_principal_point_is_found(study):
     found = _with_lens(study, aside=0.03)
     assert found.is_clear
     # Half a diagonal is 120 pixels of 192.
-    assert found.pattern.right * 120 / 192 == pytest.approx(-0.03, abs=0.003)
-    assert found.pattern.zoom == pytest.approx(0, abs=0.01)
+    assert found.change.right * 120 / 192 == pytest.approx(-0.03, abs=0.003)
+    assert found.change.zoom == pytest.approx(0, abs=0.01)
 
 
 @pytest.mark.fault("C18")
@@ -87,7 +87,7 @@ def test_distortion_that_is_not_told_is_found(study):
         bent.append(np.where(inside, picture[rows, columns], np.nan).astype(np.float32))
     found = lens_of_frames(mesh, rays, cameras, bent)
     assert found.is_clear
-    assert -0.11 < found.pattern.bend < -0.06
+    assert -0.11 < found.change.bend < -0.06
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.3])
@@ -136,8 +136,15 @@ def test_pictures_that_show_nothing_say_nothing(study):
 
 
 def test_what_chance_does_is_not_told():
-    sure = LensCheck(
-        Pattern(zoom=-0.1), moved=0.04, error=0.001, better=16, frames=16, left=0.5, apart=0.5
+    sure = Found(
+        Pattern(zoom=-0.1),
+        moved=0.04,
+        error=0.001,
+        better=16,
+        frames=16,
+        left=0.5,
+        apart=0.5,
+        form=np.eye(4),
     )
     assert sure.is_clear
     assert not replace(sure, error=0.02).is_clear

@@ -8,6 +8,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path, PurePosixPath
+from urllib.parse import quote, unquote
 
 _MAX_LENGTH = 64
 _MOST_ENDS = 16
@@ -65,6 +66,12 @@ def composed(name: str) -> str:
     """A name with its accents as most programs write them; macOS hands them on as letters of their
     own, which only look the same."""
     return unicodedata.normalize("NFC", name)
+
+
+def as_in_addresses(name: str) -> list[str]:
+    """A name, and what it is where programs write or read it as in an address of the web, in which
+    a blank is %20."""
+    return list(dict.fromkeys((name, unquote(name), quote(name, errors="replace"))))
 
 
 def ends_of(path: str) -> list[str]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import Read, read_frames
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Double, Float
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.agreement import (
     Agreement,
@@ -24,6 +26,8 @@ from usdbrdf.texturing.agreement import (
     logarithms_in_frame,
     other_convention,
 )
+from usdbrdf.texturing.pose_samples import logarithms
+from usdbrdf.texturing.registration.joint_change import FINEST
 from usdbrdf.transport.rays import RayScene
 
 ASKED = 16  # frames that are asked whether they agree
@@ -37,17 +41,29 @@ _READINGS: dict[str, Callable[[Double], Double]] = {
 _STRIDE = 4
 
 
+class Asked(NamedTuple):
+    """Of N frames that were asked: how far they agree, None where they see too few points in
+    common; logarithms of what they show of the points, (P, N); their cameras; and ``logarithms`` of
+    all that they show, small."""
+
+    agreement: Agreement | None
+    shown: Float
+    cameras: list[Camera]
+    pictures: list[Float]
+
+
 def agreement_of_frames(
     surface: MeshPoints, rays: RayScene, frames: Frames, read: Read, source: Path
-) -> tuple[Agreement | None, Float]:
-    """How far some frames agree, None where they see too few points in common, and logarithms of
-    what these show of the points, (P, N). Of much the user is to be told by
+) -> Asked:
+    """What some frames, spread evenly, show. Of much the user is to be told by
     ``doubts_about_agreement``.
 
     Raises InputRefused, in the name of ``source``, where they hardly do and would under another
     reading of the poses.
     """
     asked = spread_evenly(len(frames), ASKED)
+    cameras = [frames.camera(i) for i in asked]
+    pictures: dict[int, Float] = {}
 
     def looked_up(steps: Mapping[str, int]) -> dict[str, Float]:
         """What the frames show, under some readings, at every so many points."""
@@ -56,6 +72,8 @@ def agreement_of_frames(
         images = read_frames(read, asked)
         for i, pixels in progress(images, total=len(asked), label="agreement", unit="frames"):
             camera = frames.camera(i)
+            # Pictures are halved further where the frames' sizes differ.
+            pictures[i] = logarithms(pixels, max(1, pixels.valid.shape[1] // (2 * FINEST)))
             for name, step in steps.items():
                 pose = _READINGS[name](camera.world_from_camera)
                 other = replace(camera, world_from_camera=pose)
@@ -69,7 +87,7 @@ def agreement_of_frames(
     found = {name: agreement(some) for name, some in shown.items()}
     told = found.pop(_AS_GIVEN)
     if told and not is_doubtful(given) and not other_convention(told, found):
-        return given, rows
+        return Asked(given, rows, cameras, [*pictures.values()])
     every = {name: 1 for name in _READINGS if name != _AS_GIVEN}
     found = {name: agreement(some) for name, some in looked_up(every).items()}
     better = found.get(name := other_convention(given, found))
@@ -80,4 +98,4 @@ def agreement_of_frames(
             f"({differ}); with the poses read as {name} they would differ by {better.ratio:.0%}. "
             "Convert the poses. [capture.convention]"
         )
-    return given, rows
+    return Asked(given, rows, cameras, [*pictures.values()])

@@ -18,8 +18,8 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.agreement import ASKED, agreement_of_frames
 from usdbrdf.tasks.capture_inputs import no_asset
-from usdbrdf.tasks.lens import asked_of_its_lens
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
+from usdbrdf.tasks.registration import doubts_about_registration
 from usdbrdf.tasks.turned import frames_to_compare, refuse_turned
 from usdbrdf.texturing.agreement import doubts_about_agreement, surface_and_rays
 from usdbrdf.texturing.astray import doubts_about_places, frames_astray
@@ -52,12 +52,13 @@ def inspect(
                 refuse_turned(surface, rays, frames, found.turned_images, read, capture)
             frames = developed_frames(spread_evenly(len(every), ASKED), folder)
             read = partial(read_frame, frames)
-            agrees, shown = agreement_of_frames(surface, rays, frames, read, capture)
+            asked = agreement_of_frames(surface, rays, frames, read, capture)
             names = [path.name for path in frames.image_paths]
-            doubts = [*doubts_about_agreement(agrees, capture)]
-            astray = frames_astray(shown)
+            doubts = [*doubts_about_agreement(asked.agreement, capture)]
+            astray = frames_astray(asked.shown)
             doubts += doubts_about_places(astray, names, capture)
-            doubts += asked_of_its_lens(mesh, rays, frames, read, capture, astray)
+            metres = found.meters_per_unit or 1.0
+            doubts += doubts_about_registration(mesh, rays, asked, astray, capture, metres)
             objects = found.objects
             if options.objects == AUTO:
                 frames = developed_frames(frames_that_tell_colours(mesh, len(every)), folder)
@@ -65,7 +66,7 @@ def inspect(
                 mesh, objects, _ = segmented(mesh, found.own_faces, frames, read)
     except InputRefused as refusal:
         return replace(found, refusals=(*found.refusals, refusal))
-    warnings = (*found.warnings, *doubts)
+    warnings, agrees = (*found.warnings, *doubts), asked.agreement
     return replace(
         found, mesh=mesh, objects=objects, warnings=warnings, agreement=agrees and agrees.ratio
     )

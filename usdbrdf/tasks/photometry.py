@@ -18,10 +18,10 @@ from usdbrdf.model.capture import Scan
 from usdbrdf.model.upright import as_captured, upright
 from usdbrdf.options import AUTO, IngestOptions
 from usdbrdf.tasks.agreement import agreement_of_frames
-from usdbrdf.tasks.lens import asked_of_its_lens
 from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.optics import asked_of_its_optics
 from usdbrdf.tasks.poses import with_refined_poses
+from usdbrdf.tasks.registration import doubts_about_registration
 from usdbrdf.tasks.task import warned
 from usdbrdf.tasks.turned import refuse_turned
 from usdbrdf.texturing.agreement import (
@@ -44,10 +44,13 @@ def asked_of_its_pixels(
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))
     surface, rays = surface_and_rays(scan.mesh)
     refuse_turned(surface, rays, scan.frames, scan.turned_images, read, scan.source)
-    agrees, shown = agreement_of_frames(surface, rays, scan.frames, read, scan.source)
+    asked = agreement_of_frames(surface, rays, scan.frames, read, scan.source)
+    agrees, astray = asked.agreement, frames_astray(asked.shown)
     warnings = warned(doubts_about_agreement(agrees, scan.source))
-    astray = frames_astray(shown)
-    warnings += warned(asked_of_its_lens(scan.mesh, rays, scan.frames, read, scan.source, astray))
+    metres = scan.meters_per_unit
+    warnings += warned(
+        doubts_about_registration(scan.mesh, rays, asked, astray, scan.source, metres)
+    )
     estimate = options.vignetting == "estimate"
     scan, told, doubts = asked_of_its_optics(scan, surface, rays, read, estimate=estimate)
     warnings += warned(doubts)

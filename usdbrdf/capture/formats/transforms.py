@@ -41,6 +41,7 @@ from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.colour import kind_of_encoding, known_encodings
 from usdbrdf.files.documents import read_json
 from usdbrdf.files.images import MAX_SIDE, image_size
+from usdbrdf.files.naming import as_in_addresses
 from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
@@ -350,7 +351,8 @@ def _record(
         lambda said: capture.refuse(f"the frame {name!r} {said}", "capture.camera"),
     )
     needed = capture.images or not stated
-    path = capture.pictured.of(name) if needed else capture.source.parent / name
+    found = filter(None, map(capture.pictured.of, as_in_addresses(name)))
+    path = next(found, None) if needed else capture.source.parent / name
     if path is None:
         findings.drop(name, "the image file does not exist", "capture.file")
         return None
