@@ -143,7 +143,8 @@ def _sure(right=0.05, other=0.052, **changes):
 def test_what_chance_does_is_not_told():
     assert _sure().is_clear
     assert _sure().error == pytest.approx(0.001)
-    assert not _sure(other=-0.05).is_clear
+    assert _sure(other=-0.05).is_clear
+    assert not _sure(other=-0.05, better=12).is_clear
     assert not _sure(moved=0.001).is_clear
     assert not _sure(left=0.995).is_clear
     assert not _sure(apart=0.05).is_clear

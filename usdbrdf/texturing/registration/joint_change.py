@@ -136,9 +136,13 @@ class _Frames:
     """Cameras and pictures, from the smallest size to the largest, and what they show of points."""
 
     def __init__(
-        self, mesh: ScanMesh, rays: RayScene, cameras: Sequence[Camera], pictures: Sequence[Float]
+        self,
+        rays: RayScene,
+        cameras: Sequence[Camera],
+        pictures: Sequence[Float],
+        surface: MeshPoints,
     ) -> None:
-        self.surface = _points_seen(mesh, rays, cameras)
+        self.surface = surface
         self.cameras = cameras
         self.sizes = [[_no_wider(picture, FINEST) for picture in pictures]]
         while _may_be_halved(self.sizes[0], 2 * _COARSEST):
@@ -174,7 +178,7 @@ class _Frames:
 
 
 def best_change(
-    mesh: ScanMesh,
+    surface: MeshPoints,
     rays: RayScene,
     cameras: Sequence[Camera],
     pictures: Sequence[Float],
@@ -182,6 +186,7 @@ def best_change(
 ) -> Found[C] | None:
     """None where few frames share few points, or what is sought runs away.
 
+    surface   the points that are asked, which ``rays`` are of
     pictures  the frames' ``logarithms``, in any size
     starts    the first of them no change, or what all is held against, to be begun from that under
               which frames agree best
@@ -189,7 +194,7 @@ def best_change(
     narrowest = min((min(picture.shape) for picture in pictures), default=0)
     if len(cameras) < _MIN_FRAMES or narrowest < _LEAST_SIDE:
         return None
-    frames = _Frames(mesh, rays, cameras, pictures)
+    frames = _Frames(rays, cameras, pictures, surface)
     begun = [frames.shown(0, start) for start in starts]
     most = max(len(samples.point) for samples in begun)
     # One under which few points are seen at all is no better one.
@@ -230,7 +235,7 @@ def best_change(
     )
 
 
-def _points_seen(mesh: ScanMesh, rays: RayScene, cameras: Sequence[Camera]) -> MeshPoints:
+def points_seen(mesh: ScanMesh, rays: RayScene, cameras: Sequence[Camera]) -> MeshPoints:
     """Of some places in all pictures: the middles of pixels alone would be sharper than others."""
     rng = np.random.default_rng(_SEED)
     across = across_triangles(mesh.points, mesh.triangles)

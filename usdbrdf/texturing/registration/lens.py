@@ -18,11 +18,13 @@ from scipy.ndimage import map_coordinates
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.texturing.agreement import points_of_surface
 from usdbrdf.texturing.registration.joint_change import Found, best_change, half_diagonal, places_of
 from usdbrdf.transport.rays import RayScene
 
 # Focal lengths from which is started, as told being 1.
 _STARTS = (1.0, 0.62, 0.71, 0.8, 0.89, 1.12, 1.25, 1.4, 1.6)
+_POINTS = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ def lens_of_frames(
     pictures  the frames' ``logarithms``, in any size
     """
     starts = [Pattern(math.log(longer)) for longer in _STARTS]
-    return best_change(mesh, rays, cameras, pictures, starts)
+    surface = points_of_surface(mesh, _POINTS)
+    return best_change(surface, rays, cameras, pictures, starts)
 
 
 def said_of_lens(found: Found[Pattern], source: Path) -> str:

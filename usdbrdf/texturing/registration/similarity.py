@@ -20,7 +20,12 @@ from usdbrdf import calibration
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh
-from usdbrdf.texturing.registration.joint_change import Found, best_change, half_diagonal
+from usdbrdf.texturing.registration.joint_change import (
+    Found,
+    best_change,
+    half_diagonal,
+    points_seen,
+)
 from usdbrdf.transport.rays import RayScene
 
 _TOLD = calibration.number("similarity.told")
@@ -126,8 +131,9 @@ class SimilarityCheck:
 
     @property
     def is_clear(self) -> bool:
-        """Whether it is worth telling, and both halves tell it."""
-        return self.may_be_clear and self.found.moved > _SURE * self.error
+        """Whether it is worth telling, and both halves tell it, or nearly all frames do."""
+        told = self.found.is_clear or self.found.moved > _SURE * self.error
+        return self.halves is not None and self.may_be_clear and told
 
 
 def similarity_of_frames(
@@ -143,17 +149,27 @@ def similarity_of_frames(
     eyes = np.array([camera.eye for camera in cameras])
     x, y, z = eyes.mean(axis=0).tolist()
     reach = float(np.median(np.linalg.norm(mesh.points - eyes.mean(axis=0), axis=1)))
-    start = [Similarity((x, y, z), reach)]
-    found = best_change(mesh, rays, cameras, pictures, start)
+    found = _found_by(mesh, rays, cameras, pictures, Similarity((x, y, z), reach))
     if found is None:
         return None
     check = SimilarityCheck(found)
     if not check.may_be_clear:
         return check
     # Frames that are half as many find less from afar.
-    begun = [found.change]
-    one, other = (best_change(mesh, rays, cameras[k::2], pictures[k::2], begun) for k in (0, 1))
+    one, other = (
+        _found_by(mesh, rays, cameras[k::2], pictures[k::2], found.change) for k in (0, 1)
+    )
     return replace(check, halves=(one, other)) if one and other else check
+
+
+def _found_by(
+    mesh: ScanMesh,
+    rays: RayScene,
+    cameras: Sequence[Camera],
+    pictures: Sequence[Float],
+    start: Similarity,
+) -> Found[Similarity] | None:
+    return best_change(points_seen(mesh, rays, cameras), rays, cameras, pictures, [start])
 
 
 def said_of_similarity(check: SimilarityCheck, source: Path, millimetres: float) -> str:
