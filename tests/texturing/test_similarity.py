@@ -41,7 +41,7 @@ OTHER = Similarity((0.5, -1.0, 2.0), 3.0, 0.1, (0.1, -0.2, 0.3), (0.05, 0.02, -0
 def study():
     """Mesh, cameras and pictures of some frames of the sample."""
     scan = as_captured(read_scan(STUDY, IngestOptions()))
-    some = range(0, len(scan.frames), 5)
+    some = range(0, len(scan.frames), 3)
     pictures = [logarithms(read_frame(scan.frames, i), 1) for i in some]
     return scan.mesh, [scan.frames.camera(i) for i in some], pictures
 
