@@ -26,8 +26,8 @@ def data_of(text: str) -> dict[str, Any]:
 
 def fit_of(**numbers: Any) -> FittedObject:
     """A fit that determined nothing, with other ``numbers``."""
-    usual = {"status": "prior", "evidence": 0.4, "target_frame": 0, "cost": 0.0, "num_pixels": 9,
-             "method": "views"}  # fmt: skip
+    usual = {"status": "undetermined", "evidence": 0.4, "target_frame": 0, "cost": 0.0,
+             "num_pixels": 9, "method": "views"}  # fmt: skip
     return FittedObject(prim_path="/r", identifier="r", phi=0.3, psi=0.5, **usual | numbers)
 
 

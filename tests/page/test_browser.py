@@ -253,7 +253,8 @@ def test_verdicts_that_a_page_only_repeats_stay_of_what_was_judged(
     asset, data = Asset.made(folder), data_of(page_file.read_text("utf-8"))
     first, second = data["objects"][:2]
     write_review(
-        asset, {first["prim"]: Judgement(verdict="reject", status="prior", phi=0.11, psi=0.22)}
+        asset,
+        {first["prim"]: Judgement(verdict="reject", status="undetermined", phi=0.11, psi=0.22)},
     )
     (tmp_path / "again.html").write_text(page({**data, **reviewed(asset)}), "utf-8")
     shown = opened((tmp_path / "again.html").as_uri())
@@ -266,7 +267,7 @@ def test_verdicts_that_a_page_only_repeats_stay_of_what_was_judged(
         shown.get_by_role("button", name="Save verdicts").click()
     download.value.save_as(folder / "review.usda")
     found = read_review(asset)
-    assert (found[first["prim"]].status, found[first["prim"]].phi) == ("prior", 0.11)
+    assert (found[first["prim"]].status, found[first["prim"]].phi) == ("undetermined", 0.11)
     assert found[second["prim"]].status == second["fit"]
     assert first["prim"] in changes_since(asset)
 
@@ -302,9 +303,9 @@ def test_a_verdict_of_a_served_page_is_saved_and_comes_back(opened, served):
 def test_a_page_that_was_opened_before_takes_nothing_back_that_others_said(opened, served):
     asset, data, address = served
     first, second = data["objects"][:2]
-    write_review(asset, {first["prim"]: Judgement(verdict="accept", status="prior")})
+    write_review(asset, {first["prim"]: Judgement(verdict="accept", status="undetermined")})
     shown = opened(address)
-    write_review(asset, {first["prim"]: Judgement(verdict="reject", status="prior")})
+    write_review(asset, {first["prim"]: Judgement(verdict="reject", status="undetermined")})
     judge(shown, second["label"], "good")
     shown.get_by_role("button", name="Save verdicts").click()
     shown.get_by_text("saved in review.usda").wait_for()
@@ -318,8 +319,11 @@ GONE = "/room/geo/sofa/sofa"
 
 def test_what_was_said_of_an_object_that_is_gone_is_shown_and_taken_back(opened, served, tmp_path):
     asset, data, address = served
-    prim, kept = data["objects"][0]["prim"], Judgement(verdict="accept", status="prior", phi=0.5)
-    sofa = Judgement(verdict="reject", comment="not ours", directive="metal", status="prior")
+    prim, kept = (
+        data["objects"][0]["prim"],
+        Judgement(verdict="accept", status="undetermined", phi=0.5),
+    )
+    sofa = Judgement(verdict="reject", comment="not ours", directive="metal", status="undetermined")
     write_review(asset, {prim: kept, GONE: sofa})
     # A page that is a file hands all of it over, as long as nobody takes it back.
     (tmp_path / "page.html").write_text(page({**data, **reviewed(asset)}), "utf-8")
@@ -429,9 +433,9 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
 def test_what_was_not_fitted_says_why_and_shows_no_numbers(opened, page_file, tmp_path):
     data = data_of(page_file.read_text("utf-8"))
     pane, seen_through, *_ = (row for row in data["objects"] if row["status"] != "lamp")
-    pane |= {"status": "prior", "because": "pane", "f0": None}
+    pane |= {"status": "undetermined", "because": "pane", "f0": None}
     pane.pop("costs", None)
-    seen_through |= {"status": "prior", "because": "contradicted"}
+    seen_through |= {"status": "undetermined", "because": "contradicted"}
     (tmp_path / "pane.html").write_text(page(data), "utf-8")
     shown = opened((tmp_path / "pane.html").as_uri())
     row = shown.locator(f"#table tbody tr[data-prim='{pane['prim']}']")

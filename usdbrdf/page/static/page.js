@@ -21,7 +21,7 @@
   const percent = (value, digits = 1) => (value === null ? '\u2013' : `${(100 * value).toFixed(digits)} %`);
   const metres = (value) => `${value.toFixed(2)} m`;
   const STATUS = {
-    measured: 'measured', prior: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
+    measured: 'measured', bounded: 'no highlight', undetermined: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
     sparse: 'too few pixels', contradicted: 'seen through', pane: 'clear glass', told: 'left out', glimpsed: 'hardly shown',
   };
   // Nothing was fitted of these: the numbers that they carry stand for nothing.
@@ -603,7 +603,7 @@
   /* --- Room ---------------------------------------------------------------------------------- */
 
   function colours() {
-    const status = { measured: [0, 0.34, 0.17], prior: [0.79, 0.35, 0], unseen: [0.3, 0.3, 0.3], failed: [0.66, 0.11, 0], lamp: [0.87, 0.77, 0.05] };
+    const status = { measured: [0, 0.34, 0.17], bounded: [0.09, 0.46, 0.81], undetermined: [0.79, 0.35, 0], unseen: [0.3, 0.3, 0.3], failed: [0.66, 0.11, 0], lamp: [0.87, 0.77, 0.05] };
     const verdicts = { accept: [0, 0.34, 0.17], reject: [0.66, 0.11, 0] };
     const number = (value) => (value === null ? [0.3, 0, 0.3]
       : ramp(value).match(/\d+/g).map((byte) => (Number(byte) / 255) ** 2.2));
