@@ -351,14 +351,13 @@ class FittedObject(MeasuredObject):
     psi_error: Annotated[float, Fact(FIT, "psiError", "float", 0.0, """Standard deviation of psi,
         errors of the model included; without unit.""", low=0)] = math.nan
     psi_upper: Annotated[float, Fact(FIT, "psiUpper95", "float", 1.0, """What psi exceeds with a
-        probability of 5 %: a bound also where no highlight shows; without unit.""", low=0,
-        high=1)] = math.nan
+        probability of 5 %, where no highlight shows too; without unit.""", low=0, high=1)] = math.nan
     shown_phi: Annotated[float, Fact(FIT, "shownPhi", "float", 0.5, """The phi that the material
         shows in place of the measurement, where it is authored: what is usual for the object's
         class (option --unmeasured class); without unit.""", low=0, high=1)] = math.nan
     shown_psi: Annotated[float, Fact(FIT, "shownPsi", "float", 0.5, """The psi that the material
-        shows in place of the measurement, where it is authored; no more than psiUpper95; without
-        unit.""", low=0, high=1)] = math.nan
+        shows in its place, where authored; no more than psiUpper95; without unit.""", low=0,
+        high=1)] = math.nan
     phi_confidence: Annotated[str, Fact(FIT, "phiConfidence", "token", "none",
         _CONFIDENCE.format("phi"), tokens=_CONFIDENCES)] = "none"
     psi_confidence: Annotated[str, Fact(FIT, "psiConfidence", "token", "none",
@@ -403,7 +402,8 @@ class FittedObject(MeasuredObject):
         read=lambda status: "undetermined" if status == "prior" else status)]
     target_frame: Annotated[int, Fact(FIT, "targetFrame", "int", -1, """Index of the photograph that
         shows the highlight best, counted from 0 (time code minus 1); -1 for none.""", low=-1)]
-    num_pixels: Annotated[int, Fact(FIT, "numPixels", "int", 0, "Number of pixels used.", low=0)]
+    num_pixels: Annotated[int, Fact(FIT, "numPixels", "int", 0, """Number of pixels that the fit
+        used.""", low=0)]
     method: Annotated[str, Fact(FIT, "method", "token", "", """How it was fitted, as of --fit.""")]
     mapping: Annotated[str, Fact(FIT, "mapping", "token", "measured", """How UsdPreviewSurface was
         derived from phi and psi. measured: literally, roughness = sqrt(max(0.001, phi)), F0 = 0.08
