@@ -351,7 +351,7 @@ class FittedObject(MeasuredObject):
     psi_error: Annotated[float, Fact(FIT, "psiError", "float", 0.0, """Standard deviation of psi,
         errors of the model included; without unit.""", low=0)] = math.nan
     psi_upper: Annotated[float, Fact(FIT, "psiUpper95", "float", 1.0, """What psi exceeds with a
-        probability of 5 %, where no highlight shows too; without unit.""", low=0, high=1)] = math.nan
+        probability of 5 %, with no highlight too; without unit.""", low=0, high=1)] = math.nan
     shown_phi: Annotated[float, Fact(FIT, "shownPhi", "float", 0.5, """The phi that the material
         shows in place of the measurement, where it is authored: what is usual for the object's
         class (option --unmeasured class); without unit.""", low=0, high=1)] = math.nan
