@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tests.page.conftest import SCREENS, data_of, shuts_out
-from usdbrdf.asset.review import Judgement, read_review, write_review
+from usdbrdf.asset.review import Judgement, read_review, review_file, write_review
 from usdbrdf.page.report import page, reviewed
 
 GONE = "/room/geo/sofa/sofa"
@@ -75,3 +75,20 @@ def test_what_was_said_of_what_is_gone_shuts_nobody_out(opened, page_file, tmp_p
     # However much it is, verdicts can be saved without a way past all of it.
     assert gone.bounding_box()["height"] < 900
     assert shuts_out(shown) == {}
+
+
+def test_verdicts_on_a_version_are_handed_over_and_not_refused_once_they_are_given(opened, served):
+    asset, data, address = served
+    data["published"] = "v001"  # which writes nothing
+    shown, label = opened(address), data["objects"][0]["label"]
+    shown.get_by_role("button", name=label, exact=True).click()
+    shown.get_by_role("group", name=f"Your verdict on {label}").get_by_label("accept").check()
+    with shown.expect_download() as download:
+        shown.get_by_role("button", name="Save verdicts").click()
+    assert (
+        "of the asset that this version was published from" in shown.locator("#saved").inner_text()
+    )
+    assert not review_file(asset).exists()
+    download.value.save_as(review_file(asset))
+    assert read_review(asset)[data["objects"][0]["prim"]].verdict == "accept"
+    assert shown.faults == []

@@ -503,7 +503,7 @@
   }
 
   async function save() {
-    if (data.served) {
+    if (data.served && !data.published) {
       const sent = [...said];
       const answer = await fetch(data.served, {
         method: 'POST', headers: { 'Content-Type': 'application/json' },
@@ -527,7 +527,7 @@
         href: URL.createObjectURL(new Blob([layer()], { type: 'text/plain' })), download: 'review.usda',
       });
       link.click();
-      $('saved').textContent = 'review.usda was handed to you: put it beside edits.usda';
+      $('saved').textContent = `review.usda was handed to you: put it beside edits.usda${data.published ? ' of the asset that this version was published from' : ''}`;
     }
     unsaved = false;
   }
