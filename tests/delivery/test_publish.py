@@ -17,6 +17,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdUtils
 from tests.asset.test_input_usd import INPUT, dress
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
 from tests.json_schemas import check
+from tests.validation.faults import SURFACE, edited
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layers.scan_layer import write_pending_layer
 from usdbrdf.asset.layout import Asset
@@ -314,6 +315,23 @@ def test_a_version_is_neither_reviewed_nor_worked_in_and_bears_what_systems_leav
     assert not list(changes(version))
     (version / "more.usda").write_text("#usda 1.0\n")
     assert [what for _, what in changes(version)] == ["was added"]
+
+
+@pytest.mark.parametrize("name", ["edits.usda", "adopted-1.usda"])
+def test_what_an_artist_changed_is_theirs_in_a_version_too(room, tmp_path, name):
+    """Also where its layer has the record with which we made it, or it was adopted with."""
+    layer, edits = room.asset.folder / name, room.asset.edits_layer
+    if layer != edits:
+        shutil.copy(edits, layer)
+        with edited(edits) as opened:
+            opened.subLayerPaths.append(f"./{name}")
+    with edited(layer) as opened:
+        surface = Sdf.CreatePrimInLayer(opened, SURFACE)
+        Sdf.AttributeSpec(surface, "inputs:roughness", Sdf.ValueTypeNames.Float).default = 0.125
+        assert opened.customLayerData["usdbrdf"]["role"] == "edits"
+    publish(room.asset.folder, tmp_path)
+    for asset in (room.asset, Asset.made(tmp_path / "v001")):
+        assert own_findings(Usd.Stage.Open(str(asset.root_layer))) == []
 
 
 def test_nothing_of_any_asset_is_written_into_a_version(room, tmp_path):
