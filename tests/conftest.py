@@ -49,6 +49,7 @@ SLOW = (
     "material/test_view_model.py",
     "nondestruction",
     "page/test_browser.py",
+    "page/test_gone.py",
     "page/test_report.py",
     "paper",
     "physics/test_lobe_samples.py",

@@ -193,7 +193,7 @@ def test_an_object_that_no_frame_sees_is_neutral_and_says_so(asset):
     np.testing.assert_array_equal(read_exr(textures / "hidden.albedo.exr"), 0.5)
     for name in ("floor", "walls", "box"):
         fitted = read_fit(stage, str(prim_of(stage, name).GetPath()))
-        assert fitted.status in ("measured", "prior")
+        assert fitted.status in ("measured", "undetermined")
 
 
 def test_the_lamp_is_an_emitter_with_its_own_light(capture, asset):

@@ -82,14 +82,14 @@ def test_what_a_schema_does_not_name_is_found():
 def test_words_of_a_fit_are_those_of_the_asset():
     facts, told = dict(facts_of(FittedObject)), schema_of("run")["$defs"]["fitted"]["properties"]
     enums = {name: item["enum"] for name, item in told.items() if "enum" in item}
-    assert {*enums} >= {"status", "kind", "phi_confidence", "psi_confidence", "directive"}
+    assert {*enums} >= {"status", "model", "phi_confidence", "psi_confidence", "directive"}
     assert enums == {name: [*facts[name].tokens] for name in enums}
 
 
 def test_what_a_fit_says_is_checked():
     none = {"phi": None, "psi": 0.1, "phi_error": None, "psi_error": 0.2, "psi_upper": 0.9}
     fit = {"reran": True, "reason": "not done before"}
-    found = {**none, "status": "prior", "kind": "dielectric"}
+    found = {**none, "status": "undetermined", "model": "dielectric"}
     check({"asset": "a.usda", "steps": {"fit": {**fit, "objects": {"chair": found}}}}, "run")
     found["phi"] = "0.2"
     with pytest.raises(jsonschema.ValidationError):

@@ -19,8 +19,10 @@ STEPS = {
     "fit": {
         "objects": {
             "chair": _fit("measured", phi=0.2, psi=0.5, phi_error=0.02, psi_error=0.03),
-            "globe": _fit("prior", phi=0.5, psi=0.5, phi_error=0.29, psi_error=0.29),
-            "rug": _fit("prior", phi=0.9, psi=0.0, phi_error=0.29, psi_error=0.1, psi_upper=0.2),
+            "globe": _fit("undetermined", phi=0.5, psi=0.5, phi_error=0.29, psi_error=0.29),
+            "rug": _fit(
+                "undetermined", phi=0.9, psi=0.0, phi_error=0.29, psi_error=0.1, psi_upper=0.2
+            ),
             "shelf": _fit("unseen"),
         }
     },
@@ -46,21 +48,27 @@ def test_objects_by_status_and_what_needs_a_look():
 
 
 def test_what_a_person_left_out_needs_no_look():
-    objects = {"pane": {**_fit("prior"), "directive": "glass"}, "a": _fit("measured", phi=0.1)}
+    objects = {
+        "pane": {**_fit("undetermined"), "directive": "glass"},
+        "a": _fit("measured", phi=0.1),
+    }
     lines = table({**STEPS, "fit": {"objects": objects}}, ROOT)
     assert lines[0].endswith("2: 1 measured, 1 not fitted, as a person asked")
     assert "pane" not in "\n".join(lines)
 
 
 def test_a_pane_needs_no_look():
-    objects = {"pane": {**_fit("prior"), "kind": "transparent"}, "a": _fit("measured", phi=0.1)}
+    objects = {
+        "pane": {**_fit("undetermined"), "model": "transparent"},
+        "a": _fit("measured", phi=0.1),
+    }
     lines = table({**STEPS, "fit": {"objects": objects}}, ROOT)
     assert lines[0].endswith("2: 1 measured, 1 panes before the outside")
     assert "a look" not in "\n".join(lines)
 
 
 def test_a_long_list_is_cut():
-    objects = {f"thing_{i:02d}": _fit("prior", phi=0.5, psi=0.5) for i in range(40)}
+    objects = {f"thing_{i:02d}": _fit("undetermined", phi=0.5, psi=0.5) for i in range(40)}
     lines = table({**STEPS, "fit": {"objects": objects}}, ROOT)
     assert sum("thing_" in line for line in lines) == 12
     assert any("and 28 more" in line for line in lines)

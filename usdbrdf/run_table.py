@@ -15,7 +15,8 @@ _WORDS = {
     "lamp": ("lamps", ""),
     "unfitted": ("not fitted, as a person asked", ""),
     "pane": ("panes before the outside", ""),
-    "prior": ("not determined", "frames that see highlights on them would tell"),
+    "bounded": ("without a highlight", ""),
+    "undetermined": ("not determined", "frames that see highlights on them would tell"),
     "unseen": ("unseen", "frames show too little of them: all about them but a colour is a guess"),
     "failed": ("failed", "the target frame does not determine them"),
 }
@@ -59,7 +60,7 @@ def statuses_of(steps: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
         else "unfitted"
         if found.get("directive") in _NOT_FITTED
         else "pane"
-        if found.get("kind") == "transparent"
+        if found.get("model") == "transparent"
         else str(found["status"])
         for name, found in steps["fit"]["objects"].items()
     }
@@ -93,7 +94,7 @@ def _worth_a_look(objects: Mapping[str, Any], statuses: Mapping[str, str]) -> It
         if not advice or not names:
             continue
         yield f"{word}: {advice}"
-        if status != "prior":
+        if status != "undetermined":
             yield from _listed(names)
             continue
         wide = max(len(name) for name in names[:_MOST_ROWS])

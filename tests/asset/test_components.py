@@ -291,6 +291,27 @@ def test_an_asset_of_the_layout_without_components_is_left_alone(built):
         refuse_old_layout(built.asset)
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "compare ROOM ROOM -o new", "package ROOM -o new.usdz", "publish ROOM new",
+        "report ROOM -o new.html", "view ROOM --no-browser", "advise ROOM",
+    ],
+)  # fmt: skip
+def test_an_asset_of_the_layout_without_components_is_told_as_that(
+    built, tmp_path, monkeypatch, capsys, command
+):
+    monkeypatch.chdir(tmp_path)
+    old = new_layer(built.header, Provenance(role="root", version="1"))
+    old.Export(str(built.asset.root_layer))
+    (built.asset.folder / ".usdbrdf").mkdir()
+    words = [str(built.asset.folder) if word == "ROOM" else word for word in command.split()]
+    assert main(words) == 6
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.endswith("[ownership.layout]")
+    assert not list(tmp_path.glob("new*"))
+
+
 @pytest.mark.parametrize("role", ["root", "scan", "material"])
 def test_an_asset_of_a_newer_version_is_not_read_as_if_it_were_ours(built, role):
     """Validate says it, too: usdbrdf.SchemaVersion."""

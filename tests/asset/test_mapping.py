@@ -144,7 +144,7 @@ def test_materialx_is_told_the_same(built):
 def test_a_metal_is_told_by_its_colour_alone(built, mapping):
     f0 = (0.75, 0.5, 0.25)
     chair, *others = built.fitted
-    built.fitted = (replace(chair, kind="conductor", f0=f0, psi=1.0, f0_error=0.01), *others)
+    built.fitted = (replace(chair, model="conductor", f0=f0, psi=1.0, f0_error=0.01), *others)
     write(built, mapping)
     assert read_fit(open_measured(built.asset), chair.prim_path).psi_of_channels == pytest.approx(
         tuple(value / 0.08 for value in f0)

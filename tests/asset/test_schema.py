@@ -27,7 +27,8 @@ from usdbrdf.asset.properties import (
     facts_by_attribute,
 )
 from usdbrdf.asset.readers.compose import open_edited
-from usdbrdf.asset.readers.scene import read_record
+from usdbrdf.asset.readers.scene import read_fit, read_record
+from usdbrdf.asset.review import _judgement
 from usdbrdf.asset.schemas import plugin_path, register, verify
 from usdbrdf.errors import UsdBrdfError
 from usdbrdf.validation.record_rules import allowed_tokens, fit_range, undeclared_attribute
@@ -142,7 +143,7 @@ def test_what_is_declared_is_authored_and_the_reverse(built):
     built.scan = replace(built.scan, frames=frames)
     built.write_layer("scan")
     first, *others = built.fitted
-    metal = replace(first, kind="conductor", f0=(0.5, 0.25, 0.125), f0_error=0.03125)
+    metal = replace(first, model="conductor", f0=(0.5, 0.25, 0.125), f0_error=0.03125)
     metal = replace(metal, directive="metal")
     built.fitted = (metal, *others)
     built.write_layer("material")
@@ -186,7 +187,7 @@ def test_the_version_is_in_the_plug_in_and_in_every_layer(built):
 def test_schemas_of_another_version_are_refused_before_the_first_write(monkeypatch):
     register()
     monkeypatch.setattr(schemas, "SCHEMA_VERSION", 99)
-    with pytest.raises(UsdBrdfError, match=r"version 1.*99.*\[schema\.version\]"):
+    with pytest.raises(UsdBrdfError, match=r"version 2.*99.*\[schema\.version\]"):
         verify()
 
 
@@ -315,3 +316,24 @@ def test_a_row_more_is_declared_written_read_back_and_checked(built, generate, m
         for fault in rule.check(scene)
     ]
     assert sites == [f"{built.prims[2]}.usdBrdf:fit:{name}" for name in ("gloss", "finish")]
+
+
+def test_what_an_older_version_called_otherwise_is_read_and_valid(built):
+    """fit:kind is fit:model now, and a status of prior undetermined."""
+    layer = Sdf.Layer.FindOrOpen(str(built.asset.layer("material")))
+    spec = layer.GetPrimAtPath(built.prims[0])
+    del spec.properties["usdBrdf:fit:model"]
+    for name, word in (("kind", "conductor"), ("status", "prior")):
+        attribute = f"usdBrdf:fit:{name}"
+        if attribute in spec.properties:
+            del spec.properties[attribute]
+        token = Sdf.ValueTypeNames.Token, Sdf.VariabilityUniform
+        Sdf.AttributeSpec(spec, attribute, *token).default = word
+    layer.Save()
+    stage = Usd.Stage.Open(str(built.asset.root_layer))
+    found = read_fit(stage, built.prims[0])
+    assert (found.model, found.is_metal, found.status) == ("conductor", True, "undetermined")
+    scene = AssetStage(stage)
+    assert not [*allowed_tokens.check(scene), *undeclared_attribute.check(scene)]
+    older = {"verdict": "accept", "status": "prior", "phi": found.phi, "psi": found.psi}
+    assert _judgement(older, "<chair>").change(found) == ""

@@ -17,6 +17,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdUtils
 from tests.asset.test_input_usd import INPUT, dress
 from tests.delivery.packing import CHAIR_FILE, edit, surfaces_of
 from tests.json_schemas import check
+from tests.validation.faults import SURFACE, edited
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layers.scan_layer import write_pending_layer
 from usdbrdf.asset.layout import Asset
@@ -25,7 +26,7 @@ from usdbrdf.asset.readers import tried
 from usdbrdf.asset.review import write_review
 from usdbrdf.delivery.package import package, stage_in_look
 from usdbrdf.delivery.publish import publish, versions_in
-from usdbrdf.errors import FolderBusy, InputRefused, OwnershipConflict, UsageError
+from usdbrdf.errors import FolderBusy, InputRefused, OwnershipConflict, UsageError, UsdBrdfError
 from usdbrdf.files.atomic import make_folders, sha256_of
 from usdbrdf.files.images import read_exr
 from usdbrdf.job.ownership import folder_lock
@@ -33,7 +34,7 @@ from usdbrdf.job.stamp import Stamp, stamp_path, write_stamp
 from usdbrdf.options import PublishOptions
 from usdbrdf.page.report import report
 from usdbrdf.pipeline import working_on
-from usdbrdf.validation.validate import own_findings, validate
+from usdbrdf.validation.validate import own_findings, validate, write_cures
 
 RED = """over "room" { over "geo" { over "Stuhl_No_1" { over "mtl" {
 over "Stuhl_No_1" { over "PreviewSurface" {
@@ -308,10 +309,40 @@ def test_a_version_is_neither_reviewed_nor_worked_in_and_bears_what_systems_leav
         write_review(Asset.made(version), {})
     with pytest.raises(OwnershipConflict, match=r"never.*\[ownership\.published\]$"):
         working_on(version).__enter__()
+    with pytest.raises(OwnershipConflict, match=r"v001: .*never.*\[ownership\.published\]$"):
+        working_on(version / "layers/new").__enter__()
     (version / ".DS_Store").write_bytes(b"")
     assert not list(changes(version))
     (version / "more.usda").write_text("#usda 1.0\n")
     assert [what for _, what in changes(version)] == ["was added"]
+
+
+def test_what_an_artist_changed_is_theirs_in_a_version_too(room, tmp_path):
+    """Though edits.usda has the record with which we made it, and lies among our layers there."""
+    with edited(room.asset.edits_layer) as opened:
+        surface = Sdf.CreatePrimInLayer(opened, SURFACE)
+        Sdf.AttributeSpec(surface, "inputs:roughness", Sdf.ValueTypeNames.Float).default = 0.125
+        assert opened.customLayerData["usdbrdf"]["role"] == "edits"
+    publish(room.asset.folder, tmp_path)
+    for asset in (room.asset, Asset.made(tmp_path / "v001")):
+        assert own_findings(Usd.Stage.Open(str(asset.root_layer))) == []
+
+
+def test_nothing_of_any_asset_is_written_into_a_version(room, tmp_path):
+    """Its files alone are read-only: a folder that were is one that nobody could delete."""
+    publish(room.asset.folder, tmp_path)
+    version, before = tmp_path / "v001", bytes_of(tmp_path / "v001")
+    for asset in (room.asset.folder, version):
+        for write, rule in (
+            (lambda asset: report(asset, version / "page.html"), "report"),
+            (lambda asset: package(asset, version / "new/room.usdz"), "package"),
+        ):
+            with pytest.raises(UsdBrdfError, match=rf"v001.*\[{rule}\.output\]$"):
+                write(asset)
+        with pytest.raises(OwnershipConflict, match=r"never changes.*\[fix\.published\]$"):
+            write_cures(Asset.made(asset), version / "fixes.usda")
+    assert bytes_of(version) == before
+    assert {entry.name for entry in version.iterdir()} == {path.split("/")[0] for path in before}
 
 
 def test_one_at_a_time(room, tmp_path):

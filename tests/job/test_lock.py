@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from usdbrdf import working_on
-from usdbrdf.errors import FolderBusy
-from usdbrdf.job.ownership import folder_lock
+from usdbrdf.errors import FolderBusy, InputRefused
+from usdbrdf.job.ownership import folder_lock, reading
 
 ROOT = Path(__file__).parents[2]
 HOLD = """
@@ -113,8 +113,8 @@ def test_the_thread_that_holds_it_may_enter_again(tmp_path):
 FORK = """
 import os, sys
 from pathlib import Path
-from usdbrdf.errors import FolderBusy
-from usdbrdf.job.ownership import folder_lock
+from usdbrdf.errors import FolderBusy, InputRefused
+from usdbrdf.job.ownership import folder_lock, reading
 with folder_lock(Path(sys.argv[1])):
     child = os.fork()
     if child == 0:
@@ -202,3 +202,32 @@ def test_folder_busy_through_the_task(tmp_path, toy, toy_process):
     toy.run_toy(tmp_path / "room")
     with folder_lock(tmp_path / "room/.usdbrdf"):
         assert "FolderBusy" in toy_process(tmp_path / "room").stderr
+
+
+@pytest.mark.fault("C13")
+@pytest.mark.parametrize("taking", ["work", "read"])
+def test_what_a_newer_version_left_while_one_waited_is_not_taken(tmp_path, taking):
+    state = tmp_path / "room/.usdbrdf"
+    state.mkdir(parents=True)
+    newer_runs = threading.Event()
+
+    def newer_version():
+        with folder_lock(state):
+            newer_runs.set()
+            time.sleep(0.3)
+            (state / "job.json").write_text('{"schema": 2}')
+
+    with ThreadPoolExecutor() as pool:
+        ran = pool.submit(newer_version)
+        newer_runs.wait(200)
+        taken = (
+            folder_lock(state, wait_s=200)
+            if taking == "work"
+            else reading(state.parent, wait_s=200)
+        )
+        with pytest.raises(InputRefused, match=r"job\.json: .+newer.+\[asset\.newer\]$"), taken:
+            pass
+        ran.result()
+    (state / "job.json").unlink()
+    with folder_lock(state):  # which is free again
+        pass

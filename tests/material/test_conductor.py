@@ -234,7 +234,7 @@ def test_who_says_that_it_is_a_metal_gets_one_and_no_measurement_of_what_contrad
         clearer=metal.clearer, **errors,
     )  # fmt: skip
     verdict = judged(found, _object(), FitOptions(), True, "metal")
-    assert (verdict.kind, verdict.status) == ("conductor", "prior")
+    assert (verdict.model, verdict.status) == ("conductor", "undetermined")
     assert judged(found._replace(clearer=0.4), _object(), FitOptions(), True).status == "measured"
 
 
@@ -250,11 +250,13 @@ def test_a_metal_is_published_as_one():
         0.4, 500, 3,
     )  # fmt: skip
     verdict = judged(found, _object(), FitOptions(), True)
-    assert (verdict.kind, verdict.status, verdict.phi) == ("conductor", "measured", 0.12)
+    assert (verdict.model, verdict.status, verdict.phi) == ("conductor", "measured", 0.12)
     assert verdict.f0 == (0.9, 0.7, 0.3)
-    assert judged(found._replace(f0_error=0.2), _object(), FitOptions(), True).status == "prior"
+    assert (
+        judged(found._replace(f0_error=0.2), _object(), FitOptions(), True).status == "undetermined"
+    )
     plain = judged(found._replace(clearer=math.nan), _object(), FitOptions(), True)
-    assert plain.kind == "dielectric"
+    assert plain.model == "dielectric"
 
 
 def test_what_is_usual_is_shown_only_where_frames_tell_nothing():
@@ -264,11 +266,11 @@ def test_what_is_usual_is_shown_only_where_frames_tell_nothing():
     assert usual is not None
     nothing = ObjectFit(0.4, 0.5, 0.28, 0.28, evidence=0.05, psi_upper=0.9, num_samples=500)
     shown = judged(nothing, table, options, True)
-    assert (shown.status, shown.shown_phi, shown.shown_psi) == ("prior", *usual)
+    assert (shown.status, shown.shown_phi, shown.shown_psi) == ("undetermined", *usual)
     # All that is known of this psi is that it is no less than 1.
     bounded = ObjectFit(0.1, 1.0, 0.01, 0.02, evidence=0.9, psi_upper=1.0, num_samples=500)
     verdict = judged(bounded, table, options, True)
-    assert verdict.status == "prior"
+    assert verdict.status == "undetermined"
     assert math.isnan(verdict.shown_psi)
 
 

@@ -64,7 +64,7 @@ def test_psi_at_the_end_of_its_range_is_a_bound_and_no_measurement(psi: float):
     assert found.psi == (psi if psi < 1 else 0.95)
     assert (found.phi, found.phi_confidence) == (0.1, "high")
     assert found.psi_confidence == ("high" if psi < 1 else "low")
-    assert found.status == ("measured" if psi < 1 else "prior")
+    assert found.status == ("measured" if psi < 1 else "undetermined")
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
@@ -75,7 +75,7 @@ def test_what_views_contradict_is_no_measurement(share: float, sure: bool):
     psi_error = (0.5 if sure else 1.1) * MAX_PSI_ERROR
     given = _lobe(contradiction=share * most, psi_error=psi_error, psi_median=0.8)
     found = verdict_on_views(given, True)
-    assert found.status == ("measured" if share < 1 and sure else "prior")
+    assert found.status == ("measured" if share < 1 and sure else "undetermined")
     if share > 1:
         # What shows is what comes nearest to the views.
         assert (found.phi, found.psi) == (0.1, 0.8)
@@ -92,11 +92,11 @@ def test_each_parameter_is_judged_by_its_own_error(share: float):
     # Where psi is not determined its median stands for it.
     assert (found.phi, found.psi) == (0.1, 0.8 if share < 1 else 0.6)
     assert (found.phi_confidence, found.psi_confidence) == ("high", wanted)
-    assert found.status == ("measured" if share < 1 else "prior")
+    assert found.status == ("measured" if share < 1 else "undetermined")
     found = verdict_on_views(_lobe(phi_error=share * MAX_PHI_ERROR), True)
     assert (found.phi, found.psi) == (0.1 if share < 1 else 0.3, 0.8)
     assert (found.phi_confidence, found.psi_confidence) == (wanted, "high")
-    assert found.status == ("measured" if share < 1 else "prior")
+    assert found.status == ("measured" if share < 1 else "undetermined")
 
 
 @pytest.mark.fault("L3")
@@ -106,7 +106,24 @@ def test_without_a_highlight_what_remains_likely_is_published(evidence: float):
     assert (found.phi, found.psi, found.psi_upper) == (0.3, 0.05, 0.2)
     # However small the errors.
     assert (found.phi_confidence, found.psi_confidence) == ("none", "none")
-    assert found.status == "prior"
+    assert (found.status, found.model) == ("bounded", "dielectric")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "seen", "status", "model"),
+    [
+        ({"psi_median": 0.0, "psi_upper": 0.49}, True, "bounded", "diffuse"),
+        ({"psi_median": 0.0, "psi_upper": 0.51}, True, "undetermined", "diffuse"),
+        ({"psi_median": 0.45, "psi_upper": 0.9}, True, "undetermined", "dielectric"),
+        ({"psi_median": 0.1, "psi_upper": 0.2}, False, "unseen", "dielectric"),
+        ({"psi_median": 0.1, "psi_upper": 0.2, "contradiction": 9.0}, True, "undetermined", None),
+    ],
+)
+def test_what_is_not_measured_is_bounded_where_psi_lies_in_the_lower_half(
+    numbers, seen, status, model
+):
+    found = verdict_on_views(_lobe(evidence=0.0)._replace(**numbers), seen)
+    assert (found.status, found.model) == (status, model or found.model)
 
 
 def test_no_highlight_where_one_would_show_bounds_psi():
@@ -149,7 +166,7 @@ def test_a_cost_that_noise_of_the_rays_makes_negative_is_no_more_than_all_explai
     assert found.cost < 0
     assert found.evidence == 1
     verdict = verdict_on_views(found, True)
-    assert verdict.status == "prior"  # what is nothing but noise is no measurement
+    assert verdict.status == "undetermined"  # what is nothing but noise is no measurement
     assert np.isfinite([verdict.phi_error, verdict.psi_error]).all()
 
 
@@ -180,7 +197,7 @@ def test_of_a_mirror_the_footprint_counts_as_against_a_hundredth_of_a_radian(phi
 def test_a_lobe_within_twice_its_error_of_none_is_no_measurement(share: float):
     # In a stairwell by others a lobe of 0.5 came out as 0.04 +- 0.03.
     found = verdict_on_views(_lobe(psi=0.1, psi_error=share * 0.1), True)
-    assert found.status == ("measured" if share < 0.5 else "prior")
+    assert found.status == ("measured" if share < 0.5 else "undetermined")
 
 
 @pytest.mark.fault("L2")
@@ -190,7 +207,7 @@ def test_what_no_frame_sees_is_unseen():
     assert (found.phi_error, found.psi_error) == pytest.approx((NOTHING_KNOWN, UNASKED))
     assert (found.phi_confidence, found.psi_confidence) == ("none", "none")
     # Seen, but by too few frames for a fit.
-    assert verdict_on_views(None, True).status == "prior"
+    assert verdict_on_views(None, True).status == "undetermined"
 
 
 @pytest.mark.fault("L3")
@@ -208,12 +225,12 @@ def test_the_paper_keeps_what_it_finds_and_the_others_know_nothing(flat: float, 
     kept = verdict_on_frame((0.1, flat), 0.8, evidence, True, True)
     assert (kept.phi, kept.psi, kept.status) == (0.1, 0.8, "failed")
     prior = verdict_on_frame((0.1, flat), 0.8, evidence, True, False)
-    assert (prior.phi, prior.psi, prior.status) == (*NEUTRAL, "prior")
+    assert (prior.phi, prior.psi, prior.status) == (*NEUTRAL, "undetermined")
     assert (prior.phi_error, prior.psi_error) == pytest.approx((NOTHING_KNOWN, UNASKED))
 
 
 @pytest.mark.parametrize("keep", [True, False])
-@pytest.mark.parametrize(("seen", "status"), [(True, "prior"), (False, "unseen")])
+@pytest.mark.parametrize(("seen", "status"), [(True, "undetermined"), (False, "unseen")])
 def test_without_a_fit_there_is_nothing_to_keep(keep: bool, seen: bool, status: str):
     found = verdict_on_frame((math.nan, math.nan), math.nan, math.nan, seen, keep)
     assert (found.phi, found.psi, found.status) == (*NEUTRAL, status)
@@ -223,7 +240,7 @@ def test_one_frame_is_sure_of_nothing_of_a_metal():
     f0 = (0.9, 0.6, 0.3)
     many, one = (verdict_on_metal(0.2, f0, 1e-3, error) for error in (1e-3, math.nan))
     assert (many.status, many.phi_confidence, many.psi_confidence) == ("measured", "high", "high")
-    assert (one.status, one.phi_confidence, one.psi_confidence) == ("prior", "low", "low")
+    assert (one.status, one.phi_confidence, one.psi_confidence) == ("undetermined", "low", "low")
 
 
 def test_the_least_cost_lies_at_the_vertex_of_a_parabola():

@@ -4,59 +4,15 @@ from __future__ import annotations
 
 import re
 import shutil
-import threading
 
 import pytest
 
-from tests.page.conftest import data_of
+from tests.page.conftest import SCREENS, data_of, shuts_out
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.review import Judgement, changes_since, read_review, write_review
 from usdbrdf.delivery.publish import publish
 from usdbrdf.options import PublishOptions
 from usdbrdf.page.report import page, report, reviewed
-from usdbrdf.page.server import PageServer
-
-playwright = pytest.importorskip("playwright.sync_api", reason="needs usdbrdf[browser]")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium (Debian: apt install)")
-SOFTWARE_3D = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_3D]
-        )
-        yield browser
-        browser.close()
-
-
-@pytest.fixture
-def opened(chromium):
-    """opened(address, **context's) -> a page that is ready; what went wrong is in ``page.faults``,
-    what it asked for elsewhere in ``page.asked``."""
-    contexts = []
-
-    def open_page(address, script="", **options):
-        context = chromium.new_context(accept_downloads=True, **options)
-        contexts.append(context)
-        shown = context.new_page()
-        shown.faults, shown.asked = [], []
-        shown.on("pageerror", lambda error: shown.faults.append(str(error)))
-        shown.on(
-            "console", lambda said: shown.faults.append(said.text) if said.type == "error" else None
-        )
-        shown.on("request", lambda request: shown.asked.append(request.url))
-        if script:
-            shown.add_init_script(script)
-        shown.goto(address)
-        shown.wait_for_selector("body[data-ready=yes]", timeout=600_000)
-        return shown
-
-    yield open_page
-    for context in contexts:
-        context.close()
 
 
 def test_all_parts_are_there_and_nothing_is_asked_of_others(opened, page_file):
@@ -253,7 +209,8 @@ def test_verdicts_that_a_page_only_repeats_stay_of_what_was_judged(
     asset, data = Asset.made(folder), data_of(page_file.read_text("utf-8"))
     first, second = data["objects"][:2]
     write_review(
-        asset, {first["prim"]: Judgement(verdict="reject", status="prior", phi=0.11, psi=0.22)}
+        asset,
+        {first["prim"]: Judgement(verdict="reject", status="undetermined", phi=0.11, psi=0.22)},
     )
     (tmp_path / "again.html").write_text(page({**data, **reviewed(asset)}), "utf-8")
     shown = opened((tmp_path / "again.html").as_uri())
@@ -266,23 +223,9 @@ def test_verdicts_that_a_page_only_repeats_stay_of_what_was_judged(
         shown.get_by_role("button", name="Save verdicts").click()
     download.value.save_as(folder / "review.usda")
     found = read_review(asset)
-    assert (found[first["prim"]].status, found[first["prim"]].phi) == ("prior", 0.11)
+    assert (found[first["prim"]].status, found[first["prim"]].phi) == ("undetermined", 0.11)
     assert found[second["prim"]].status == second["fit"]
     assert first["prim"] in changes_since(asset)
-
-
-@pytest.fixture
-def served(room, page_file, tmp_path):
-    """A copy of the room's asset, what its page carries, and the address that serves it."""
-    folder = tmp_path / "room"
-    shutil.copytree(room.asset, folder)
-    asset, data = Asset.made(folder), data_of(page_file.read_text("utf-8"))
-    server = PageServer(asset, lambda at: page({**data, **reviewed(asset)}, served=at))
-    thread = threading.Thread(target=server.serve)
-    thread.start()
-    yield asset, data, server.address
-    server.close()
-    thread.join()
 
 
 def test_a_verdict_of_a_served_page_is_saved_and_comes_back(opened, served):
@@ -302,9 +245,9 @@ def test_a_verdict_of_a_served_page_is_saved_and_comes_back(opened, served):
 def test_a_page_that_was_opened_before_takes_nothing_back_that_others_said(opened, served):
     asset, data, address = served
     first, second = data["objects"][:2]
-    write_review(asset, {first["prim"]: Judgement(verdict="accept", status="prior")})
+    write_review(asset, {first["prim"]: Judgement(verdict="accept", status="undetermined")})
     shown = opened(address)
-    write_review(asset, {first["prim"]: Judgement(verdict="reject", status="prior")})
+    write_review(asset, {first["prim"]: Judgement(verdict="reject", status="undetermined")})
     judge(shown, second["label"], "good")
     shown.get_by_role("button", name="Save verdicts").click()
     shown.get_by_text("saved in review.usda").wait_for()
@@ -313,58 +256,14 @@ def test_a_page_that_was_opened_before_takes_nothing_back_that_others_said(opene
     assert found[second["prim"]].verdict == "accept"
 
 
-GONE = "/room/geo/sofa/sofa"
-
-
-def test_what_was_said_of_an_object_that_is_gone_is_shown_and_taken_back(opened, served, tmp_path):
-    asset, data, address = served
-    prim, kept = data["objects"][0]["prim"], Judgement(verdict="accept", status="prior", phi=0.5)
-    sofa = Judgement(verdict="reject", comment="not ours", directive="metal", status="prior")
-    write_review(asset, {prim: kept, GONE: sofa})
-    # A page that is a file hands all of it over, as long as nobody takes it back.
-    (tmp_path / "page.html").write_text(page({**data, **reviewed(asset)}), "utf-8")
-    for address_of_page in ((tmp_path / "page.html").as_uri(), address):
-        shown = opened(address_of_page)
-        item = shown.locator("#gone li")
-        assert item.inner_text().startswith(f"{GONE}: reject; for the next run metal; not ours")
-        if address_of_page == address:
-            break
-        with shown.expect_download() as download:
-            shown.get_by_role("button", name="Save verdicts").click()
-        download.value.save_as(asset.folder / "review.usda")
-        assert read_review(asset) == {prim: kept, GONE: sofa}
-    shown.get_by_role("button", name=f"Take back what was said of {GONE}").click()
-    shown.get_by_role("button", name="Save verdicts").click()
-    shown.get_by_text("saved in review.usda").wait_for()
-    assert read_review(asset) == {prim: kept}
-    assert shown.faults == []
-    assert opened(address).locator("#gone li").count() == 0
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(1440, "light"), (390, "dark")])
-def test_what_was_said_of_what_is_gone_shuts_nobody_out(opened, page_file, tmp_path, width, scheme):
-    data = data_of(page_file.read_text("utf-8"))
-    data["review"] = {GONE: {"verdict": "reject", "comment": "x" * 200, "directive": ""}}
-    (tmp_path / "page.html").write_text(page(data), "utf-8")
-    shown = opened(
-        (tmp_path / "page.html").as_uri(),
-        viewport={"width": width, "height": 900}, color_scheme=scheme,
-    )  # fmt: skip
-    wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
-    assert shown.evaluate(wide) <= 0
-
-
-@pytest.mark.parametrize(("width", "scheme"), [(1440, "light"), (390, "dark")])
+@SCREENS
 def test_nobody_is_shut_out(opened, page_file, width, scheme):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
     shown = opened(
         page_file.as_uri(), viewport={"width": width, "height": 900}, color_scheme=scheme
     )
     shown.locator("button.name").first.click()
     assert shown.evaluate("document.documentElement.scrollWidth") <= width
-    found = axe.Axe().run(shown).response["violations"]
-    serious = [v["id"] for v in found if v["impact"] in ("serious", "critical")]
-    assert serious == [], [node["html"][:200] for v in found for node in v["nodes"]]
+    assert shuts_out(shown) == {}
 
 
 @pytest.mark.parametrize("width", [1440, 390, 320])
@@ -429,9 +328,9 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
 def test_what_was_not_fitted_says_why_and_shows_no_numbers(opened, page_file, tmp_path):
     data = data_of(page_file.read_text("utf-8"))
     pane, seen_through, *_ = (row for row in data["objects"] if row["status"] != "lamp")
-    pane |= {"status": "prior", "because": "pane", "f0": None}
+    pane |= {"status": "undetermined", "because": "pane", "f0": None}
     pane.pop("costs", None)
-    seen_through |= {"status": "prior", "because": "contradicted"}
+    seen_through |= {"status": "undetermined", "because": "contradicted"}
     (tmp_path / "pane.html").write_text(page(data), "utf-8")
     shown = opened((tmp_path / "pane.html").as_uri())
     row = shown.locator(f"#table tbody tr[data-prim='{pane['prim']}']")

@@ -260,7 +260,7 @@ def test_evidence_is_drawn_of_what_was_fitted_alone(monkeypatch):
     monkeypatch.setattr(objects, "_evidence", lambda *_: np.ones((1, 1)))
     drawn = [fit_of(status="measured"), fit_of(), fit_of(status="failed"),
              fit_of(contradiction=0.45)]  # fmt: skip
-    left = [fit_of(evidence=math.nan), fit_of(directive="glass"), fit_of(kind="transparent"),
+    left = [fit_of(evidence=math.nan), fit_of(directive="glass"), fit_of(model="transparent"),
             fit_of(status="lamp"), fit_of(status="unseen")]  # fmt: skip
     fits, count = drawn + left, len(drawn + left)
     monkeypatch.setattr(objects, "_numbers", lambda _a, i, *_: {"status": fits[i].status})
@@ -279,7 +279,9 @@ def test_a_frame_is_read_and_traced_once_however_many_objects_it_shows(monkeypat
     pixels = SimpleNamespace(radiance=np.zeros((1, 1, 3)), valid=np.ones((1, 1), bool))
     monkeypatch.setattr(objects, "read_frame", lambda _, number: read.append(number) or pixels)
     monkeypatch.setattr(objects, "seen_in_frame", lambda _, view: traced.append(view.camera))
-    monkeypatch.setattr(objects, "_numbers", lambda _a, i, *_: {"prim": i, "status": "prior"})
+    monkeypatch.setattr(
+        objects, "_numbers", lambda _a, i, *_: {"prim": i, "status": "undetermined"}
+    )
 
     def pictures(frame, _seen, index, box, **_):
         assert frame.view.camera == frame.number
@@ -315,7 +317,7 @@ def test_of_more_lamps_than_a_page_can_light_the_weakest_are_one():
 
 
 def test_the_counts_of_all_objects_are_told_and_hundreds_of_lamps_in_one_sentence():
-    words = ["measured", "prior", "failed", "failed", "unseen", "lamp"]
+    words = ["measured", "undetermined", "failed", "failed", "unseen", "lamp"]
     lamps = {f"bulb_{i}": 1.0 for i in range(200)}
     found = {"texture": {}, "shade": {"estimated_emitters": lamps}}
     told = findings(found, words, True)

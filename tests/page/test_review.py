@@ -39,23 +39,32 @@ def fit(**numbers):
     ("numbers", "told"),
     [
         ({}, r"by directive\.$"),
-        ({"status": "prior"}, r"by directive\. Dielectrics explain the photographs no worse\.$"),
-        ({"status": "prior", "psi_confidence": "low"}, r"\. Its numbers are not known well\.$"),
-        ({"status": "prior", "f0_error": math.nan}, r"One frame cannot tell whether it is one\.$"),
-        ({"status": "prior", "kind": "dielectric"}, r"photographs do not show enough\.$"),
+        (
+            {"status": "undetermined"},
+            r"by directive\. Dielectrics explain the photographs no worse\.$",
+        ),
+        (
+            {"status": "undetermined", "psi_confidence": "low"},
+            r"\. Its numbers are not known well\.$",
+        ),
+        (
+            {"status": "undetermined", "f0_error": math.nan},
+            r"One frame cannot tell whether it is one\.$",
+        ),
+        ({"status": "undetermined", "model": "dielectric"}, r"photographs do not show enough\.$"),
     ],
 )
 def test_of_a_metal_by_directive_the_page_says_no_more_than_is_known(numbers, told):
     sure = {"phi_confidence": "high", "psi_confidence": "high", "f0_error": 0.01}
-    found = fit(**{"directive": "metal", "kind": "conductor", **sure, **numbers})
+    found = fit(**{"directive": "metal", "model": "conductor", **sure, **numbers})
     assert re.search(told, why(found, found.status, None))
 
 
 def test_of_what_is_seen_through_page_and_run_say_so():
-    found = fit(status="prior", contradiction=0.45)
-    assert "Its views contradict by 45% that it is a surface" in why(found, "prior", None)
-    assert "shows the outside through it" not in why(fit(), "prior", None)
-    pane = why(fit(status="prior", kind="transparent"), "prior", None)
+    found = fit(status="undetermined", contradiction=0.45)
+    assert "Its views contradict by 45% that it is a surface" in why(found, "undetermined", None)
+    assert "shows the outside through it" not in why(fit(), "undetermined", None)
+    pane = why(fit(status="undetermined", model="transparent"), "undetermined", None)
     assert pane.startswith("Photographs show the outside through it")
     assert not fit().doubts
     (told,) = found.doubts
@@ -65,16 +74,16 @@ def test_of_what_is_seen_through_page_and_run_say_so():
 @pytest.mark.parametrize(
     ("numbers", "reason", "told"),
     [
-        ({}, "prior", "1 is not determined: no photograph shows a clear highlight"),
+        ({}, "undetermined", "1 is not determined: no photograph shows a clear highlight"),
         ({"evidence": math.nan}, "sparse", "1 is seen in too few pixels for a fit"),
         ({"contradiction": 0.45}, "contradicted", "The views of 1 contradict that it is a surface"),
         ({"directive": "glass", "evidence": math.nan}, "told", "1 was not fitted, by directive."),
-        ({"kind": "transparent"}, "pane", "1 is a pane before the outside."),
+        ({"model": "transparent"}, "pane", "1 is a pane before the outside."),
     ],
 )
 def test_the_page_tells_apart_why_numbers_are_not_determined(numbers, reason, told):
-    found = fit(status="prior", **numbers)
-    assert undetermined_because(found, "prior") == reason
+    found = fit(status="undetermined", **numbers)
+    assert undetermined_because(found, "undetermined") == reason
     assert undetermined_because(found, "lamp") == "lamp"
     steps = {"texture": {}, "shade": {}}
     (said,) = findings(steps, [reason], True)[1:]
@@ -139,7 +148,7 @@ def test_a_verdict_says_what_changed_since():
     judged = Judgement(verdict="accept", status="measured", phi=0.25, psi=0.5)
     assert judged.change(fit()) == ""
     assert judged.change(fit(phi=0.2501)) == ""
-    told = judged.change(fit(status="prior", phi=0.4))
+    told = judged.change(fit(status="undetermined", phi=0.4))
     assert told == (
         "accepted as measured, phi 0.25, psi 0.50; now not determined, phi 0.40, psi 0.50."
     )

@@ -19,7 +19,9 @@ from usdbrdf.transport.environment import NO_SUN, Environment, Sun
 def test_the_findings_say_what_is_known_of_the_light_from_outside():
     def told(dark=False, **outside):
         shade = {"escaped_fraction": 0.25, **outside}
-        return findings({"texture": {}, "shade": shade}, ["prior"], True, dark_outside=dark)[-1]
+        return findings({"texture": {}, "shade": shade}, ["undetermined"], True, dark_outside=dark)[
+            -1
+        ]
 
     begins = "25.0% of the directions in which surfaces look leave the scan."
     assert told() == f"{begins} What is out there counts as dark."
@@ -71,8 +73,8 @@ def test_metals_and_parts_that_shine_are_named():
     ("numbers", "in_sight", "because"),
     [
         ({"status": "measured"}, True, "measured"),
-        ({}, True, "prior"),
-        ({"kind": "transparent"}, True, "pane"),
+        ({}, True, "undetermined"),
+        ({"model": "transparent"}, True, "pane"),
         ({"contradiction": 0.45}, True, "contradicted"),
         ({"evidence": math.nan}, True, "sparse"),
         ({"directive": "ignore"}, True, "told"),

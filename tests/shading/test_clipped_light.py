@@ -86,12 +86,13 @@ def _estimated(
     environment: Environment = NO_LIGHT,
     said: Mapping[int, bool] = NOTHING_SAID,
     open_to_sky: tuple[int, ...] = (),
+    seen: np.ndarray | None = None,
 ) -> ClippedLight:
     eyes = [np.array(eye) for eye in ((0.4, 0.4, 1.5), (3.6, 2.6, 1.5), (0.4, 2.6, 1.2))]
     frames = frames_at([look_at(eye, np.array([2.0, 1.5, 1.0])) for eye in eyes])
     surface = TexturedScene(world.scene, world.texels, world.rays, panes=open_to_sky)
     run = TaskRun(folder, "shade", folder / "work")
-    coverage = CoverageMap.of(~clipped, clipped)
+    coverage = CoverageMap.of(~clipped if seen is None else seen, clipped)
     return estimate_clipped_light(run, surface, lit, coverage, frames, environment, 0, said)
 
 
@@ -190,6 +191,21 @@ def test_the_lamps_are_as_bright_as_their_light_says(
         error = light.error_of_object(lamp)
         assert UNTOLD < error < 1.3 * UNTOLD
         assert np.abs(np.log(found / expected)).max() < error
+
+
+def test_a_lamp_is_as_bright_as_its_light_says_where_next_to_nothing_of_it_is_seen(
+    world: World, truth: np.ndarray, tmp_path: Path
+):
+    """Three of its texels, as of a spot that is seen from the side."""
+    owner = world.texels.object_index()
+    own, clipped = np.flatnonzero(owner == 6), (truth >= SATURATION).any(axis=1)
+    clipped[own[3:]] = False
+    seen = ~clipped & (owner != 6)
+    lit = np.where((clipped | (owner == 6))[:, None], np.float32(SATURATION), truth)
+    light = _estimated(world, lit, clipped, tmp_path, seen=seen)
+    assert light.groups.small[light.groups.object == 6].tolist() == [True]
+    found = light.lit[own].mean(axis=0)
+    assert np.abs(np.log(found / LAMPS[0])).max() < light.error_of_object(6) < 0.5
 
 
 def test_light_that_did_not_clip_stays_as_it_is(world: World, truth: np.ndarray, tmp_path: Path):

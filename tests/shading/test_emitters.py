@@ -73,6 +73,20 @@ def test_what_exceeds_light_that_is_known_badly_is_no_emitter(world: World, lit:
     assert found(np.inf).is_lamp[2]
 
 
+def test_the_inside_of_a_bulb_which_no_frame_shows_does_not_keep_it_from_being_a_lamp(
+    world: World, lit: np.ndarray
+):
+    shading, everywhere = np.full_like(lit, SHADING), np.ones(len(lit), bool)
+    own = np.flatnonzero(world.texels.object_index() == LAMP)
+    shading[own[64:]] = np.pi * lit[own[0]]
+    inside = np.isin(np.arange(len(lit)), own[64:])
+    given = world.texels, lit, shading, everywhere, ~everywhere
+    found = find_emitters(*given, observed=~inside)
+    assert found.is_lamp[LAMP]
+    assert found.emissive[own].all()
+    assert not find_emitters(*given).is_lamp[LAMP]
+
+
 def test_single_noisy_texels_are_no_lamps(world: World, lit: np.ndarray):
     wall = np.flatnonzero(world.texels.object_index() == 0)
     # Isolated in the atlas: every fourth texel of every fourth row.

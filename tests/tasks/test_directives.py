@@ -64,7 +64,7 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
         "box": "ignore",
     }
     for name in ("box", "walls"):
-        assert (fits[name].num_pixels, fits[name].status) == (0, "prior")
+        assert (fits[name].num_pixels, fits[name].status) == (0, "undetermined")
     assert [name for name, fit in fits.items() if fit.is_glass] == ["walls"]
     surface = UsdShade.Shader.Get(stage, "/room/geo/walls/mtl/walls/PreviewSurface")
     shown = {n: surface.GetInput(n).Get() for n in ("opacity", "roughness", "ior", "diffuseColor")}
@@ -93,12 +93,16 @@ def test_the_steps_do_what_is_asked_and_only_those_that_it_concerns(tmp_path):
         usdbrdf.convert(capture.folder, folder, replace(OPTIONS, fit=fit))
         stage = open_measured(asset)
         floor, walls = (read_fit(stage, f"/room/geo/{name}/{name}") for name in ("floor", "walls"))
-        assert (floor.directive, floor.kind, floor.status) == ("metal", "conductor", "prior")
+        assert (floor.directive, floor.model, floor.status) == (
+            "metal",
+            "conductor",
+            "undetermined",
+        )
         assert (floor.phi_confidence, floor.psi_confidence) == ("low", "low")
         assert math.isnan(floor.f0_error)
         assert all(0 <= value <= 1 for value in floor.f0)
         assert any(floor.f0)
-        assert (walls.directive, walls.kind) == ("", "dielectric")
+        assert (walls.directive, walls.is_metal) == ("", False)
         surface = UsdShade.Shader.Get(stage, "/room/geo/floor/mtl/floor/PreviewSurface")
         assert surface.GetInput("metallic").Get() == 1
         assert not has_errors(validate(asset.root_layer))
@@ -129,7 +133,7 @@ def test_panes_are_clear_glass_unless_a_person_says_otherwise(tmp_path, monkeypa
     stage, shaded, fitted = found(of_shade)
     assert shaded.lets_through
     assert not read_shading(stage, "/room/geo/box/box").lets_through
-    assert (fitted.kind, fitted.directive, fitted.num_pixels) == ("transparent", "", 0)
+    assert (fitted.model, fitted.directive, fitted.num_pixels) == ("transparent", "", 0)
     rendered = render_scene_from_stage(stage, time_code(stage, None), lambda _: None)
     assert [s.name for s in rendered.surfaces if s.material.clear] == ["/room/geo/walls/walls"]
     # One that is brighter than what reaches it is no lamp: the sky behind it is.
@@ -145,9 +149,9 @@ def test_panes_are_clear_glass_unless_a_person_says_otherwise(tmp_path, monkeypa
     lit_by_sky = read_shading(stage, "/room/geo/floor/floor").escaped_fraction
     assert lit_by_sky > 0.05
     _, shaded, fitted = found(of_shade, walls="refit")
-    assert (shaded.lets_through, fitted.kind, fitted.directive) == (True, "dielectric", "refit")
+    assert (shaded.lets_through, fitted.is_glass, fitted.directive) == (True, False, "refit")
     stage, shaded, fitted = found(OPTIONS.shade)
-    assert (shaded.lets_through, fitted.kind) == (False, "dielectric")
+    assert (shaded.lets_through, fitted.is_glass) == (False, False)
     assert read_shading(stage, "/room/geo/floor/floor").escaped_fraction < lit_by_sky
 
 

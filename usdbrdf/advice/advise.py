@@ -52,7 +52,7 @@ from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.errors import InputRefused
 from usdbrdf.evaluation.evaluate_views import measured_atlas, viewed_asset
 from usdbrdf.files.atomic import environment_failures
-from usdbrdf.job.ownership import folder_lock, refuse_newer_state
+from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import STATE_FOLDER
 from usdbrdf.material.fit_views import MIN_OBSERVATIONS
 from usdbrdf.model.capture import Frames
@@ -104,7 +104,6 @@ def advise(
     asset = Asset.made(Path(folder))
     refuse_published(asset)
     state = asset.folder / STATE_FOLDER
-    refuse_newer_state(state)
     with environment_failures(str(state)), folder_lock(state, wait_s, without_lock=without_lock):
         place, atlas = measured_atlas(asset.folder, chosen.lighting)
         # Where none is asked for it is the one that the asset opens in.

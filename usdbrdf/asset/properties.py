@@ -13,12 +13,12 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 from usdbrdf.asset.layout import path_in_asset, path_in_layer
 from usdbrdf.model.arrays import Array, Float
-from usdbrdf.model.mesh import OF_FIT, OF_SHADE
+from usdbrdf.model.mesh import IN_PART, OF_FIT, OF_SHADE
 from usdbrdf.transport.brdf import F0_OF_PSI
 
 # What every layer and the plug-in state. It rises when an attribute changes its meaning or goes
 # away, not when one is added.
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 # In the names of a schema that is applied several times, in the place of the instance.
 INSTANCE = "__INSTANCE_NAME__"
 Colour = tuple[float, float, float]
@@ -75,7 +75,8 @@ class Fact:
     when: Callable[[Any], bool] = lambda record: True  # whether a record has it to say
     absent: Any = None  # what a record holds where nothing is authored; None: see ``unknown``
     stored: Callable[[Any], Any] = lambda value: value  # from the field's value to the attribute's
-    read: Callable[[Any], Any] = lambda value: value  # and back
+    read: Callable[[Any], Any] = lambda value: value  # and back, from what older versions said too
+    formerly: str = ""  # the name in assets of older versions, if it was another
 
     @property
     def is_uniform(self) -> bool:
@@ -116,9 +117,10 @@ OUTSIDE = Schema("Outside", "usdBrdf:outside", "Imageable", "sky", """The light 
     outside the scan: a picture of the surroundings, and the sun, which the picture does not
     show.""")
 SCHEMAS = (OBJECT, CAPTURE, AOV, TEXTURING, SHADING, FIT, EMITTER, OUTSIDE)
+_STATUSES = ("measured", *IN_PART, "unseen", "failed")
+_MODELS = ("dielectric", "diffuse", "conductor", "transparent")
 _CONFIDENCES = ("high", "low", "none")
-_CONFIDENCE = """high: the photographs determine {0}; low: they say something of it, and the values
-    of the class the rest; none: {0} is the value of the class."""
+_CONFIDENCE = "high: photographs determine {0}; low: say something of it; none: next to nothing."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,14 +351,13 @@ class FittedObject(MeasuredObject):
     psi_error: Annotated[float, Fact(FIT, "psiError", "float", 0.0, """Standard deviation of psi,
         errors of the model included; without unit.""", low=0)] = math.nan
     psi_upper: Annotated[float, Fact(FIT, "psiUpper95", "float", 1.0, """What psi exceeds with a
-        probability of 5 %: a bound also where no highlight shows; without unit.""", low=0,
-        high=1)] = math.nan
+        probability of 5 %, with no highlight too; without unit.""", low=0, high=1)] = math.nan
     shown_phi: Annotated[float, Fact(FIT, "shownPhi", "float", 0.5, """The phi that the material
         shows in place of the measurement, where it is authored: what is usual for the object's
         class (option --unmeasured class); without unit.""", low=0, high=1)] = math.nan
     shown_psi: Annotated[float, Fact(FIT, "shownPsi", "float", 0.5, """The psi that the material
-        shows in place of the measurement, where it is authored; no more than psiUpper95; without
-        unit.""", low=0, high=1)] = math.nan
+        shows in its place, where authored; no more than psiUpper95; without unit.""", low=0,
+        high=1)] = math.nan
     phi_confidence: Annotated[str, Fact(FIT, "phiConfidence", "token", "none",
         _CONFIDENCE.format("phi"), tokens=_CONFIDENCES)] = "none"
     psi_confidence: Annotated[str, Fact(FIT, "psiConfidence", "token", "none",
@@ -366,10 +367,10 @@ class FittedObject(MeasuredObject):
         microfacet: Smith's masking of alpha, and Fresnel's equations; beckmann: these with
         facets after Beckmann. Either all objects of an asset have the paper's or none has.""",
         tokens=("paper", "microfacet", "beckmann"))] = "paper"
-    kind: Annotated[str, Fact(FIT, "kind", "token", "dielectric", """dielectric: a diffuse colour
-        under a lobe; conductor: a metal, a lobe alone whose reflectance differs by channel;
-        transparent: clear glass, not fitted, by directive or as the outside shows through it.""",
-        tokens=("dielectric", "conductor", "transparent"))] = "dielectric"
+    model: Annotated[str, Fact(FIT, "model", "token", "dielectric", """dielectric: a diffuse colour
+        under a lobe; diffuse: a colour alone, without evidence of more; conductor: a metal, a lobe
+        alone whose reflectance differs by channel; transparent: clear glass, not fitted.""",
+        formerly="kind", tokens=_MODELS)] = "dielectric"
     directive: Annotated[str, Fact(FIT, "directive", "token", "", """What a person asked of the fit,
         in review.usda or in the capture's objects, and it followed. ignore: nothing was fitted;
         metal: a conductor was, whatever explains the photographs better; glass: nothing was, and
@@ -378,8 +379,8 @@ class FittedObject(MeasuredObject):
     f0: Annotated[Colour, Fact(FIT, "f0", "color3f", (0, 0, 0), """Reflectance of a conductor at
         normal incidence, per channel; 0 to 1, without unit.""", low=0, high=1,
         when=lambda fitted: fitted.is_metal)] = (0.0, 0.0, 0.0)
-    f0_error: Annotated[float, Fact(FIT, "f0Error", "float", 0.0, """Standard deviation of a
-        conductor's F0, root mean square over the channels; without unit.""", low=0)] = math.nan
+    f0_error: Annotated[float, Fact(FIT, "f0Error", "float", 0.0, """Standard deviation of F0 over
+        channels, root mean square; without unit.""", low=0)] = math.nan
     cost: Annotated[float, Fact(FIT, "cost", "float", 0.0, """Loss of the fit at its minimum: of
         method views per degree of freedom, in units of the errors' variance; of scaled the mean
         over the pixels used, relative to their squared radiance; of paper that in squared units of
@@ -393,18 +394,17 @@ class FittedObject(MeasuredObject):
         where it is too large for a surface, and things are seen through or in it; without unit.""",
         low=0)] = math.nan
     status: Annotated[str, Fact(FIT, "status", "token", "unseen", """measured: phi and psi come from
-        the photographs, and their stated errors are small; prior: they do not determine both, whose
-        values are the medians of what remains likely if all was equally likely before; unseen: no
-        photograph shows enough of the object; failed: method paper alone, which keeps its minimum
-        even where the photograph does not determine it.""",
-        tokens=("measured", "prior", "unseen", "failed"))]
+        the photographs, and their stated errors are small; bounded: no highlight shows though one
+        would, so that psi is below psiUpper95; undetermined: they say less. Of these two the values
+        are the medians of what remains likely if all was equally likely before. unseen: no
+        photograph shows enough of the object; failed: of method paper, whose minimum is kept
+        though the photograph does not determine it.""", tokens=_STATUSES,
+        read=lambda status: "undetermined" if status == "prior" else status)]
     target_frame: Annotated[int, Fact(FIT, "targetFrame", "int", -1, """Index of the photograph that
-        shows the highlight best, counted from 0 (time code minus 1); -1 where there is none.""",
-        low=-1)]
+        shows the highlight best, counted from 0 (time code minus 1); -1 for none.""", low=-1)]
     num_pixels: Annotated[int, Fact(FIT, "numPixels", "int", 0, """Number of pixels that the fit
         used.""", low=0)]
-    method: Annotated[str, Fact(FIT, "method", "token", "", """Name of the fitting method, as the
-        option --fit spells it.""")]
+    method: Annotated[str, Fact(FIT, "method", "token", "", """How it was fitted, as of --fit.""")]
     mapping: Annotated[str, Fact(FIT, "mapping", "token", "measured", """How UsdPreviewSurface was
         derived from phi and psi. measured: literally, roughness = sqrt(max(0.001, phi)), F0 = 0.08
         psi. matched: the reflectance and a factor on the diffuse colour were refitted, so that
@@ -427,11 +427,11 @@ class FittedObject(MeasuredObject):
 
     @property
     def is_metal(self) -> bool:
-        return self.kind == "conductor"
+        return self.model == "conductor"
 
     @property
     def is_glass(self) -> bool:
-        return self.kind == "transparent"
+        return self.model == "transparent"
 
     @property
     def is_contradicted(self) -> bool:
@@ -459,7 +459,7 @@ class FittedObject(MeasuredObject):
     def summary(self) -> dict[str, Any]:
         """What a summary says of the object, JSON."""
         names = ("phi", "psi", "phi_error", "psi_error", "psi_upper", "phi_confidence",
-                 "psi_confidence", "status", "evidence", "target_frame", "kind")
+                 "psi_confidence", "status", "evidence", "target_frame", "model")
         row = {name: getattr(self, name) for name in names}
         if self.directive:
             row["directive"] = self.directive

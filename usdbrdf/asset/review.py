@@ -40,7 +40,7 @@ _STRING = re.compile(r'"""(?:\\.|[^\\])*?"""|"(?:\\.|[^"\\])*"', re.DOTALL)
 _VERSION = "1"  # of what is written, not of the program
 _WORDS = {
     "accept": "accepted", "reject": "rejected", "": "judged",
-    "measured": "measured", "prior": "not determined",
+    "measured": "measured", "bounded": "without a highlight", "undetermined": "not determined",
 }  # fmt: skip
 
 
@@ -164,6 +164,8 @@ def _judgement(said: Any, subject: str) -> Judgement:
             )
         if value is not None:
             known[item.name] = float(value) if number else value
+    if known.get("status") == "prior":  # as older versions called it
+        known["status"] = "undetermined"
     return Judgement(**known)
 
 

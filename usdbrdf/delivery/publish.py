@@ -4,7 +4,6 @@ never changed again. The work folder keeps ``edits.usda``; a version has what it
 from __future__ import annotations
 
 import hashlib
-import re
 import shutil
 import string
 from collections.abc import Iterable, Iterator
@@ -16,8 +15,8 @@ from pxr import Sdf
 
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layers.interface import UNPUBLISHED
-from usdbrdf.asset.layout import Asset
-from usdbrdf.asset.manifest import MANIFEST, Manifest, changes, read_manifest, write_manifest
+from usdbrdf.asset.layout import VERSION, Asset
+from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
 from usdbrdf.asset.readers.compose import not_run, open_edited, outdated_steps, steps_to_come
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
 from usdbrdf.delivery.packaged_files import ADDRESS
@@ -34,7 +33,6 @@ from usdbrdf.options import PublishOptions
 
 _LOCKED = ".usdbrdf-publish"  # holds the lock of a folder of versions
 _STAGED = "staged"  # in there, what is not whole yet
-_VERSION = re.compile(r"v(\d{3,9})")
 _ENCODINGS = {"text": "usda", "binary": "usdc"}
 
 
@@ -68,13 +66,6 @@ def publish(
             f"{destination}: this is a file, and versions are published into a folder. Choose "
             "another place. [publish.destination]"
         )
-    inner = destination.resolve()
-    for place in (inner, *inner.parents):
-        if (place / MANIFEST).is_file() and _VERSION.fullmatch(place.name):
-            raise OwnershipConflict(
-                f"{destination}: {place} is a published version, which never changes. Name the "
-                "folder of all versions. [publish.destination]"
-            )
     with reading(asset.folder, wait_s=wait_s):
         _refuse_unsound(asset, options)
         with (
@@ -87,7 +78,7 @@ def publish(
 def _refuse_names(options: PublishOptions, name: str) -> None:
     """UsageError for what can be no version's name or address, whatever the asset holds."""
     version = options.version or "v001"
-    if not _VERSION.fullmatch(version):
+    if not VERSION.fullmatch(version):
         raise UsageError(
             f"--version {version}: versions are v and a number of three digits or more, such as "
             "v001. [publish.version]"
@@ -177,7 +168,7 @@ def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict
 
 def versions_in(destination: Path) -> list[str]:
     """Names of the versions in a folder, the latest last."""
-    names = [entry.name for entry in destination.iterdir() if _VERSION.fullmatch(entry.name)]
+    names = [entry.name for entry in destination.iterdir() if VERSION.fullmatch(entry.name)]
     return sorted(names, key=lambda name: int(name[1:]))
 
 

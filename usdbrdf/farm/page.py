@@ -15,7 +15,7 @@ from usdbrdf.page.static_parts import static_part
 # Of a status -> the class whose colour the reports give to what is alike.
 _LOOKS = {
     "good": "measured", "invalid": "failed", "refused": "failed", "crashed": "failed",
-    "defect": "failed", "unfinished": "prior", "begun": "prior", "waiting": "unseen",
+    "defect": "failed", "unfinished": "undetermined", "begun": "undetermined", "waiting": "unseen",
 }  # fmt: skip
 
 

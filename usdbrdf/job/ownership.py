@@ -18,7 +18,7 @@ from datetime import datetime, timezone
 from functools import wraps
 from inspect import signature
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from usdbrdf.errors import EnvironmentFailure, FolderBusy, InputRefused, NoLocks, OwnershipConflict
 from usdbrdf.files.atomic import TEMPORARY_PREFIX, environment_failures, flush_folder, sha256_of
@@ -70,7 +70,8 @@ def folder_lock(
 
     The file stays and means nothing by itself; nobody ever has to delete it. FileNotFoundError: the
     folder is not there, or was removed by the holder that this call waited for. OwnershipConflict:
-    something else has the file's name.
+    something else has the file's name. InputRefused: a newer version made the asset, maybe while
+    this call waited for it.
     """
     # The library filelock gives none of this on all Pythons that we run on: its locks (flock)
     # outlive us in forked children, its earlier versions empty the file of the one who waits for
@@ -94,6 +95,7 @@ def folder_lock(
                 _wait_or_refuse(path, deadline, signed or _UNSIGNED)
             if not os.path.samestat(os.fstat(descriptor), path.stat()):
                 raise FileNotFoundError(errno.ENOENT, "the lock was removed", str(path))
+            _refuse_newer_state(path.parent)
             since = datetime.now(timezone.utc).isoformat(timespec="seconds")
             signature = f"pid {os.getpid()} on {socket.gethostname()} since {since}"
             os.ftruncate(descriptor, 0)
@@ -171,8 +173,8 @@ def _reading(place: Path, wait_s: float) -> Iterator[None]:
     if is_held(state) or not state.is_dir():
         yield
         return
-    refuse_newer_state(state)
     with _shared(state / "lock", wait_s) as locked:
+        _refuse_newer_state(state)
         if any(state.glob("publishing-*.json")):
             raise InputRefused(
                 f"{state.parent}: a run was stopped while it put its files in place. Run `usdbrdf "
@@ -281,21 +283,24 @@ _RECORD = "job.json"
 _WRITTEN = ("layers", "textures")
 
 
-def refuse_newer_state(state: Path) -> bool:
+def _refuse_newer_state(state: Path) -> None:
     """InputRefused where a newer version made the asset of this state folder: what it means by
-    what lies there this one cannot know. Whether its record is there and sound."""
-    record = state / _RECORD
-    try:
-        document = read_json(record)
-    except InputRefused:  # it only says whose folder this is
-        return False
+    what lies there this one cannot know."""
+    document = _record_in(state)
     schema = document.get("schema") if isinstance(document, dict) else None
     if isinstance(schema, int) and schema > JOB_SCHEMA:
         raise InputRefused(
-            f"{record}: written by a newer usdbrdf (schema {schema}, this one knows {JOB_SCHEMA}). "
-            "Install that version, or convert the capture into a new folder. [asset.newer]"
+            f"{state / _RECORD}: written by a newer usdbrdf (schema {schema}, this one knows "
+            f"{JOB_SCHEMA}). Install that version, or convert the capture into a new folder. "
+            "[asset.newer]"
         )
-    return True
+
+
+def _record_in(state: Path) -> Any:
+    """What tells whose folder it is, and no more; None where it is not there or damaged."""
+    with suppress(InputRefused):
+        return read_json(state / _RECORD)
+    return None
 
 
 @contextmanager
@@ -325,7 +330,7 @@ def owned_folder(asset: Path, *, wait_s: float = 0.0, without_lock: bool = False
             held.enter_context(_removed_if_unused(asset, made))
             record, folders = state / _RECORD, ("stamps", "work", "cache")
             refuse_misplaced(asset, [record], [state / name for name in folders])
-            if not refuse_newer_state(state):
+            if _record_in(state) is None:
                 write_json(record, {"schema": JOB_SCHEMA, "tool": "usdbrdf"})
                 # Files of ours that a power cut spares would be nobody's without it.
                 for folder in (state, *made):

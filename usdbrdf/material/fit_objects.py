@@ -48,7 +48,7 @@ from usdbrdf.material.verdict import (
 )
 from usdbrdf.model.arrays import Array, Bool, Float, Int
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import GLASS, LEFT_OUT, METAL, REFIT
+from usdbrdf.model.mesh import GLASS, IN_PART, LEFT_OUT, METAL, REFIT
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import FitOptions
 from usdbrdf.transport.brdf import BECKMANN, DIELECTRIC, PAPER
@@ -450,7 +450,7 @@ def judged(
     """What to publish and to show of a fit; ``observed``: some frame shows the object; ``asked``:
     what a person wanted of it."""
     if asked == GLASS:
-        return replace(verdict_on_views(None, observed), kind="transparent")
+        return replace(verdict_on_views(None, observed), model="transparent")
     if math.isfinite(found.clearer):
         f0 = found.red, found.green, found.blue
         errors = found.metal_phi_error, found.f0_error
@@ -467,6 +467,6 @@ def judged(
         verdict = verdict_on_frame(phi, found.psi, found.evidence, observed, keep)
     usual = usual_lobe(obj.class_name, obj.label) if options.unmeasured == "class" else None
     # What frames tell of a lobe without measuring it is more than what is usual.
-    if usual is None or verdict.status != "prior" or verdict.psi_confidence != "none":
+    if usual is None or verdict.status not in IN_PART or verdict.psi_confidence != "none":
         return verdict
     return replace(verdict, shown_phi=usual[0], shown_psi=min(usual[1], verdict.psi_upper))

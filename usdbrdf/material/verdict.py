@@ -188,6 +188,7 @@ def usual_lobe(class_name: str, label: str) -> tuple[float, float] | None:
 SOME_EVIDENCE = calibration.number("verdict.some_evidence")
 MOST_CONTRADICTED = calibration.number("verdict.most_contradicted")
 MOST_OF_MEASURED = calibration.number("verdict.most_contradicted_of_measured")
+_BOUNDED = calibration.number("verdict.bounded")
 MAX_PHI_ERROR = calibration.number("verdict.max_phi_error")
 MAX_PSI_ERROR = calibration.number("verdict.max_psi_error")
 _MAX_F0_ERROR = calibration.number("conductor.max_f0_error")
@@ -199,12 +200,12 @@ _MIN_EVIDENCE_OF_FRAME = calibration.number("verdict.of_frame.min_evidence")
 
 @dataclass(frozen=True)
 class Verdict:
-    """phi, psi and their standard deviations (NaN: not known); status "measured", "prior",
-    "unseen" or "failed"; confidence in either, "high", "low" or "none"; psi_upper: what psi exceeds
-    with a probability of 5 % (NaN: not known); shown_phi, shown_psi: what is shown instead of what
-    was found (NaN: that itself); kind "dielectric", "conductor" with its f0 and the error of that,
-    or "transparent"; contradiction: what the frames hold against its being a surface (NaN:
-    nothing)."""
+    """phi, psi and their standard deviations (NaN: not known); status "measured", "bounded",
+    "undetermined", "unseen" or "failed"; confidence in either, "high", "low" or "none"; psi_upper:
+    what psi exceeds with a probability of 5 % (NaN: not known); shown_phi, shown_psi: what is shown
+    instead of what was found (NaN: that itself); model "dielectric", "diffuse", "conductor" with
+    its f0 and the error of that, or "transparent"; contradiction: what the frames hold against its
+    being a surface (NaN: nothing)."""
 
     phi: float
     psi: float
@@ -216,7 +217,7 @@ class Verdict:
     psi_upper: float = math.nan
     shown_phi: float = math.nan
     shown_psi: float = math.nan
-    kind: str = "dielectric"
+    model: str = "dielectric"
     f0: tuple[float, float, float] = (0.0, 0.0, 0.0)
     f0_error: float = math.nan
     contradiction: float = math.nan
@@ -228,7 +229,7 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     What the frames determine is published as found. Of a highlight that is hardly larger than the
     samples' footprint they say something, but the stated error includes what the footprint may have
     done. Where they do not determine both numbers, the medians of what remains likely are
-    published: no highlight is knowledge too.
+    published: no highlight is knowledge too, which bounds psi where one would have shown.
     What is seen through a thing, or in it, changes with the view as no lobe does: then the numbers
     are none of a surface's and not measured; they stay, for what shows resembles the views more
     than what has no lobe. Names and classes of objects tell nothing here.
@@ -258,11 +259,21 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     clear = sure == ("high", "high")
     if lobe.contradiction > (MOST_OF_MEASURED if clear else MOST_CONTRADICTED):
         contradiction, sure = lobe.contradiction, ("none", "none")
-    status = "measured" if sure == ("high", "high") else "prior" if seen else "unseen"
+    psi_upper = max(lobe.psi_upper, psi)
+    status = "undetermined" if seen else "unseen"
+    if sure == ("high", "high"):
+        status = "measured"
+    elif seen and psi_upper < _BOUNDED and math.isnan(contradiction):
+        status = "bounded"
     return Verdict(
         phi, psi, float(phi_error), float(psi_error), status, *sure,
-        psi_upper=max(lobe.psi_upper, psi), contradiction=contradiction,
+        psi_upper=psi_upper, contradiction=contradiction, model=_model_of(psi),
     )  # fmt: skip
+
+
+def _model_of(psi: float) -> str:
+    """Of what is no metal, nor clear."""
+    return "dielectric" if psi > 0 else "diffuse"
 
 
 def verdict_on_metal(
@@ -281,9 +292,10 @@ def verdict_on_metal(
     measured = (phi_sure, f0_sure) == ("high", "high") and likelier
     # psi is at the bound of all dielectrics.
     psi_error = float(np.minimum(f0_error / F0_OF_PSI, NOTHING_KNOWN))  # NaN if F0's is
+    status = "measured" if measured else "undetermined"
     return Verdict(
-        phi, 1.0, phi_error, psi_error, "measured" if measured else "prior", phi_sure, f0_sure,
-        psi_upper=1.0, kind="conductor", f0=f0, f0_error=f0_error,
+        phi, 1.0, phi_error, psi_error, status, phi_sure, f0_sure,
+        psi_upper=1.0, model="conductor", f0=f0, f0_error=f0_error,
     )  # fmt: skip
 
 
@@ -296,10 +308,12 @@ def verdict_on_frame(
     measured = fitted and evidence >= _MIN_EVIDENCE_OF_FRAME and phi[1] <= _MAX_FLAT_PHI
     if measured or (fitted and keep):
         status = "measured" if measured else "failed"
-        return Verdict(phi[0], psi, phi[1], math.nan, status, "low", "low")
+        model = _model_of(psi)
+        return Verdict(phi[0], psi, phi[1], math.nan, status, "low", "low", model=model)
     return _not_asked(seen)
 
 
 def _not_asked(seen: bool) -> Verdict:
     errors = float(NOTHING_KNOWN), UNASKED
-    return Verdict(*NEUTRAL, *errors, "prior" if seen else "unseen", psi_upper=1.0)
+    status, model = "undetermined" if seen else "unseen", _model_of(NEUTRAL[1])
+    return Verdict(*NEUTRAL, *errors, status, psi_upper=1.0, model=model)

@@ -18,6 +18,8 @@ LAMP, METAL, GLASS, REFIT = "lamp", "metal", "glass", "refit"
 OF_SHADE, OF_FIT = (LAMP, "not-lamp"), ("ignore", METAL, GLASS, REFIT)
 DIRECTIVES = (*OF_FIT, *OF_SHADE)
 LEFT_OUT = ("ignore", GLASS)
+# What the status of a fit is where frames do not determine it, but tell of it, or may.
+IN_PART = ("bounded", "undetermined")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -162,10 +162,15 @@ def findings(
             f"{len(metals)} {_by_count(len(metals), 'is a metal', 'are metals')}: "
             f"{first_of(metals, _MOST_NAMED)}."
         )
-    if prior := count.get("prior"):
+    if bounded := count.get("bounded"):
         told.append(
-            f"{prior} {_by_count(prior, 'is', 'are')} not determined: no photograph shows a clear "
-            "highlight, so the numbers are what remains likely, with an upper bound."
+            f"{bounded} {_by_count(bounded, 'reflects', 'reflect')} little: no photograph shows a "
+            "highlight where a glossier surface would show one, which bounds the specular number."
+        )
+    if unknown := count.get("undetermined"):
+        told.append(
+            f"{unknown} {_by_count(unknown, 'is', 'are')} not determined: no photograph shows a "
+            "clear highlight, or could, so the numbers are what remains likely."
         )
     if sparse := count.get("sparse"):
         told.append(

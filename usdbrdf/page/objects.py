@@ -20,7 +20,7 @@ from usdbrdf.job.progress import progress
 from usdbrdf.material.fit_target import FrameSeen, frame_samples, relative_costs, seen_in_frame
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
-from usdbrdf.model.mesh import LAMP, LEFT_OUT
+from usdbrdf.model.mesh import IN_PART, LAMP, LEFT_OUT
 from usdbrdf.model.scene import SceneObject
 from usdbrdf.options import EvaluateOptions
 from usdbrdf.page.pictures import Seen, data_uri, part_around, status_of
@@ -115,7 +115,7 @@ def _numbers(
         "status": status,
         "because": undetermined_because(fit, status, in_sight=in_sight),
         "fit": fit.status,
-        "kind": fit.kind,
+        "model": fit.model,
         "directive": fit.directive or (shading.directive if shading else ""),
         "phi": finite(fit.phi, 4),
         "phi_error": finite(fit.phi_error, 4),
@@ -207,7 +207,7 @@ def undetermined_because(fit: FittedObject | None, status: str, *, in_sight: boo
     an object that counts as unseen lies ``in_sight`` of a camera; else ``status``."""
     if status == "unseen" and in_sight:
         return "glimpsed"
-    if fit is None or status != "prior":
+    if fit is None or status not in IN_PART:
         return status
     if fit.directive in LEFT_OUT:
         return "told"
@@ -234,7 +234,7 @@ def _of_metal(fit: FittedObject) -> str:
     """How sure that is, as the end of a sentence, or of two."""
     if not fit.is_metal:
         return ", of which the photographs do not show enough."
-    if fit.status != "prior":
+    if fit.status == "measured":
         return "."
     if math.isnan(fit.f0_error):
         return ". One frame cannot tell whether it is one."

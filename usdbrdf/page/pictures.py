@@ -29,7 +29,8 @@ _MARGIN = 0.2
 # Okabe and Ito's colours, which people with any sight tell apart.
 STATUS_COLOURS = {
     "measured": (0, 158, 115),
-    "prior": (230, 159, 0),
+    "bounded": (86, 180, 233),
+    "undetermined": (230, 159, 0),
     "unseen": (150, 150, 150),
     "failed": (213, 94, 0),
     "lamp": (240, 228, 66),

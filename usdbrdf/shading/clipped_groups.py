@@ -18,7 +18,6 @@ from usdbrdf.shading.clipped_emitters import LAMP_PRIOR
 from usdbrdf.shading.lamp_light import Lamps
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
-_SHOWN_OF_SMALL = calibration.number("lamps.shown_of_small")
 # More lamps are not told apart; the faintest keep their bounds.
 _MAX_GROUPS = 24
 _REACH = calibration.number("lamps.reach")
@@ -84,7 +83,8 @@ def clipped_groups(
 ) -> ClippedGroups:
     """An object more than half of whose observed area clipped is one group, with what nobody saw
     of it; on others each connected part is one. Few texels are none, unless they are all that was
-    seen of an object, and enough of it, or a person says that it is a lamp.
+    seen of an object, or a person says that it is a lamp: whether they are a lamp or a glint is
+    told by the light that they cast.
 
     radiance (T, 3): L_d, a lower bound where ``coverage`` says clipped
     said     of objects whether they are lamps, where that is known
@@ -98,8 +98,7 @@ def clipped_groups(
         candidates, around = own[clipped[own]], own[measured[own]]
         shines = texels.area[candidates].sum()
         whole, small = shines > texels.area[around].sum(), len(candidates) < _MIN_TEXELS
-        shown = not len(around) and shines > _SHOWN_OF_SMALL * texels.area[own].sum()
-        if small and not (whole and said.get(i, shown)):
+        if small and not (whole and said.get(i, not len(around))):
             continue
         parts = [own[~measured[own]]] if whole else _connected(texels, candidates)
         for part in parts:

@@ -66,6 +66,7 @@ def find_emitters(
     unseen_lamps: Int | None = None,
     said: Mapping[int, bool] = MappingProxyType({}),
     doubt: float = 0.0,
+    observed: Bool | None = None,
 ) -> Emitters:
     """Emissive texels from L_d and S (T, 3), grouped per object.
 
@@ -78,6 +79,8 @@ def find_emitters(
     said: of objects whether they shine as a whole or not at all, whatever they show
     doubt: relative standard error of S, of which what shines must be clear: what stands in a sun
     that is known badly is no lamp
+    observed (T,): by which of the texels seen or clipped an object is a lamp as a whole, all by
+    default: of a bulb of glass the inside, which no frame shows, is lit by all the rest of it
     """
     light = radiance.mean(axis=1)
     shines = np.pi * light > clear_of(doubt) * irradiance.mean(axis=1)
@@ -93,7 +96,8 @@ def find_emitters(
     for i in range(num_objects):
         own = texels.of_object(i)
         area = np.where(known[own], texels.area[own], 0)
-        is_lamp[i] = (area * shines[own]).sum() > _WHOLE_LAMP * area.sum()
+        shown = area if observed is None else area * observed[own]
+        is_lamp[i] = (shown * shines[own]).sum() > _WHOLE_LAMP * shown.sum()
         is_lamp[i] &= np.count_nonzero(shines[own] & known[own]) >= telling(len(area))
         is_lamp[i] = said.get(i, is_lamp[i])
         if is_lamp[i]:
@@ -476,8 +480,9 @@ def shade_surface(
     doubt = _doubt(texels, light, unseen, outside, seen, irradiance)
     dimmest = light.least_of_lamps(clear_of(doubt) / np.pi * irradiance.max(axis=1))
     emitters = find_emitters(
-        texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt
-    )
+        texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt,
+        coverage.observed,
+    )  # fmt: skip
     told = coverage.tells_albedo
     albedo, over = albedo_map(texels, light.lit, irradiance, told, emitters.emissive)
     over &= seen & ~panes

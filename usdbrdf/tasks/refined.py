@@ -42,7 +42,7 @@ def fitted_objects(
         observed = any(some.is_observed(i) for some in maps)
         judgement = judged(own, obj, options, observed, wanted.get(i, ""))
         # A metal's numbers are of the facets of renderers.
-        lobe = BECKMANN_FACETS if own.beckmann and judgement.kind == "dielectric" else MICROFACET
+        lobe = BECKMANN_FACETS if own.beckmann and judgement.model != "conductor" else MICROFACET
         objects.append(
             FittedObject(
                 prim_path=obj.prim_path,

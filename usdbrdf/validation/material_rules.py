@@ -10,7 +10,8 @@ from typing import Any
 from pxr import Gf, Sdf, Usd, UsdShade
 
 from usdbrdf.asset.preview_lobe import CLEAR_GLASS, MICROFACET, preview_surface_from_fit
-from usdbrdf.asset.readers.scene import authored
+from usdbrdf.asset.properties import facts_by_attribute
+from usdbrdf.asset.readers.scene import authored, stored
 from usdbrdf.validation.rule import AssetStage, Fault, Severity, Site, cure, rule
 
 Types = Sdf.ValueTypeNames
@@ -20,6 +21,7 @@ _BLACK = Gf.Vec3f(0.0)
 _TOLERANCE = 1e-4
 # Fits from before the mapping was recorded have none; of one that is not known nothing can be said.
 _MEASURED = "measured"
+_MODEL = facts_by_attribute()["usdBrdf:fit:model"]
 _MAPPINGS = (_MEASURED, "matched", MICROFACET)
 _SHOWN = ("usdBrdf:fit:shownPhi", "usdBrdf:fit:shownPsi")
 _RECORD = ("usdBrdf:fit:phi", "usdBrdf:fit:psi", "usdBrdf:fit:mapping")
@@ -130,8 +132,8 @@ def _contradictions(scene: AssetStage, item: Usd.Prim) -> Iterator[tuple[Usd.Att
         return
     if not (0 <= phi <= 1 and 0 <= psi <= 1):
         return
-    kind = authored(item, "usdBrdf:fit:kind")
-    glass, metal = kind == "transparent", kind == "conductor"
+    model = stored(item, _MODEL)
+    glass, metal = model == "transparent", model == "conductor"
     wanted = CLEAR_GLASS if glass else preview_surface_from_fit(phi, psi, _mapping(item))
     diffuse = None if metal or glass else surface.GetInput("diffuseColor")
     sources = diffuse.GetConnectedSources()[0] if diffuse else []

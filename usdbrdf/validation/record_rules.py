@@ -25,6 +25,10 @@ _PINHOLE = ("usdBrdf:capture:pinhole", "usdBrdf:capture:resolution")
 _MEASURED = tuple(schema.attribute(schema.key) for schema in (TEXTURING, SHADING, FIT))
 # The table, by the attributes' names.
 FACTS = facts_by_attribute()
+# By the names of older versions.
+_OLDER = {
+    f"{fact.schema.namespace}:{fact.formerly}": fact for fact in FACTS.values() if fact.formerly
+}
 
 
 @cure("exposure:responsivity")
@@ -191,19 +195,28 @@ def _authored_facts(prims: Sequence[Usd.Prim]) -> Iterator[tuple[Usd.Attribute, 
             parts = name.split(":")
             general = ":".join([*parts[:2], INSTANCE, *parts[3:]])
             instance = parts[2] if name not in FACTS and general in FACTS else ""
-            yield found, FACTS.get(general if instance else name), instance
+            yield found, FACTS.get(general if instance else name, _OLDER.get(name)), instance
+
+
+_STATED = {
+    "measured": ["phi", "psi", "phiError"],
+    "bounded": ["phi", "psi", "psiUpper95"],
+    "undetermined": ["phi", "psi"],
+    "prior": ["phi", "psi"],  # as older versions called it
+}
 
 
 @rule(Severity.ERROR)
 def fit_status(scene: AssetStage) -> Iterator[Fault]:
     """An object whose status is measured states phi, psi, their errors and how far the photographs
-    determine them; one whose status is prior states phi and psi. A number without its error must
+    determine them; one whose status is bounded states phi, psi and psiUpper95, one whose status is
+    undetermined phi and psi. A number without its error must
     not pass for a measurement.
 
     Run usdbrdf fit again; do not change the status by hand."""
     for prim in scene.recorded:
         status = authored(prim, "usdBrdf:fit:status")
-        wanted = {"measured": ["phi", "psi", "phiError"], "prior": ["phi", "psi"]}.get(status, [])
+        wanted = _STATED.get(status, [])
         if status == "measured" and authored(prim, "usdBrdf:fit:method") == "views":
             wanted = [*wanted, "psiError"]  # a single frame does not tell it
         missing = [name for name in wanted if authored(prim, f"usdBrdf:fit:{name}") is None]
@@ -223,7 +236,7 @@ def allowed_tokens(scene: AssetStage) -> Iterator[Fault]:
     Use one of the words that the message lists."""
     for attribute, fact, _ in _authored_facts(scene.recorded):
         value = attribute.Get()
-        if fact and fact.tokens and value not in fact.tokens:
+        if fact and fact.tokens and fact.read(value) not in fact.tokens:
             yield Fault(attribute, f"{value!r} is none of {', '.join(fact.tokens)}.")
 
 

@@ -52,9 +52,12 @@ class AssetStage:
         return tuple(layer for layer in self.layers if self._is_own(layer))
 
     def _is_own(self, layer: Sdf.Layer) -> bool:
-        folder = self.asset.folder / "layers" if self.asset else None
-        placed = layer.realPath and Path(layer.realPath).parent == folder
-        return bool(record_of(layer) and placed)
+        if self.asset is None or not layer.realPath:
+            return False
+        path = Path(layer.realPath)
+        # In a published version the edits lie there, too.
+        placed = path.parent == self.asset.folder / "layers" and path != self.asset.edits_layer
+        return bool(placed and record_of(layer))
 
     @cached_property
     def asset_root(self) -> Sdf.Layer | None:

@@ -5,7 +5,8 @@ The usdview and the Blender plug-in are installed apart: each has its copy of th
 
 _STATUS = {
     "measured": "MEASURED in the photographs",
-    "prior": "PRIOR, not measured: values of the object's class, with what the photographs say",
+    "bounded": "BOUNDED, not measured: no highlight, though one of a glossier surface would show",
+    "undetermined": "UNDETERMINED, not measured: what remains likely by the photographs",
     "unseen": "UNSEEN, not measured: no photograph shows enough of the object",
     "failed": "FAILED, not measured: the photograph does not determine the values",
 }
@@ -42,6 +43,7 @@ def _object(facts):
 
 def _status(facts):
     status = facts.get("usdBrdf:fit:status", "")
+    status = "undetermined" if status == "prior" else status  # in assets of older versions
     return _STATUS.get(status, f"{status or 'not fitted'}, not measured")
 
 

@@ -36,7 +36,7 @@ class USDBRDF_PT_fit(_Tab, bpy.types.Panel):
             split = self.layout.split(factor=0.35)
             split.label(text=label)
             lines = split.column(align=True)
-            # A prior must not pass for a measurement.
+            # What is likely must not pass for a measurement.
             lines.alert = label == "Status" and not measured
             for line in textwrap.wrap(value, _WIDTH):
                 lines.label(text=line)

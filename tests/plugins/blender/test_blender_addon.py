@@ -252,7 +252,7 @@ def test_convert_in_the_background(session, program, tmp_path):
     assert labels(told["panel"]).startswith("Done")
     assert told["idle"] == [True, False]
     # Imported at the end, with what was found.
-    assert told["properties"]["box"]["usdBrdf:fit:status"] in ("measured", "prior")
+    assert told["properties"]["box"]["usdBrdf:fit:status"] in ("measured", "undetermined")
 
 
 @needs_blender

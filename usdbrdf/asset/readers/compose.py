@@ -11,7 +11,14 @@ from typing import Any, NoReturn
 
 from pxr import Sdf, Tf, Usd, UsdUtils
 
-from usdbrdf.asset.header import Provenance, new_layer, read_header, read_provenance, refuse_newer
+from usdbrdf.asset.header import (
+    Provenance,
+    new_layer,
+    read_header,
+    read_provenance,
+    refuse_newer,
+    refuse_old_layout,
+)
 from usdbrdf.asset.layout import LIGHTING, ROLES, Asset, open_metadata
 from usdbrdf.asset.manifest import refuse_converted
 from usdbrdf.asset.maps import AssetMaps
@@ -67,6 +74,8 @@ def open_weaker(asset: Asset, role: str) -> Usd.Stage:
 def open_measured(asset: Asset) -> Usd.Stage:
     """All layers that the tool wrote, without the artist's, in the asset's lighting."""
     refuse_converted(asset)
+    with suppress(InputRefused):  # what is wrong with the root is no matter here
+        refuse_old_layout(asset)
     common = replace(asset, lighting="")
     return _in_lighting(_sublayered(common, [common.layer(role) for role in ROLES]), asset)
 
@@ -79,6 +88,7 @@ def open_edited(asset: Asset) -> Usd.Stage:
     try_in_child(asset.root_layer, beside=beside)
     stage = open_stage(asset.root_layer)
     refuse_newer(asset.root_layer, *map(asset.layer, ROLES))
+    refuse_old_layout(asset)
     for file in beside:
         open_metadata(file)  # which names it
         stage.GetSessionLayer().subLayerPaths.append(str(file))

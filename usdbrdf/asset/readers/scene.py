@@ -22,6 +22,7 @@ from usdbrdf.asset.properties import (
     SHADING,
     TEXTURING,
     Aov,
+    Fact,
     FittedObject,
     LightFromOutside,
     Photographs,
@@ -293,6 +294,13 @@ def authored(prim: Usd.Prim, name: str) -> Any:
     return attribute.Get() if attribute and attribute.HasAuthoredValue() else None
 
 
+def stored(prim: Usd.Prim, fact: Fact, instance: str = "") -> Any:
+    """As ``authored``, of an asset of an older version too."""
+    value = authored(prim, fact.attribute(instance))
+    older = value is None and fact.formerly
+    return authored(prim, f"{fact.schema.namespace}:{fact.formerly}") if older else value
+
+
 def is_measured(prim: Usd.Prim, schema: Schema) -> bool:
     """Whether anybody measured of a prim what the schema is about."""
     return authored(prim, schema.attribute(schema.key)) is not None
@@ -360,7 +368,7 @@ def read_record(kind: type[Record], prim: Usd.Prim, instance: str = "", **others
     fields, row_type = dict(others), cast(type, kind)
     rows = facts_of(row_type)
     for field, fact in rows:
-        value = authored(prim, fact.attribute(instance))
+        value = stored(prim, fact, instance)
         if value is not None and field not in fields:
             if isinstance(value, Sdf.AssetPath):
                 value = value.path

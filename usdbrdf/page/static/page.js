@@ -21,7 +21,7 @@
   const percent = (value, digits = 1) => (value === null ? '\u2013' : `${(100 * value).toFixed(digits)} %`);
   const metres = (value) => `${value.toFixed(2)} m`;
   const STATUS = {
-    measured: 'measured', prior: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
+    measured: 'measured', bounded: 'no highlight', undetermined: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
     sparse: 'too few pixels', contradicted: 'seen through', pane: 'clear glass', told: 'left out', glimpsed: 'hardly shown',
   };
   // Nothing was fitted of these: the numbers that they carry stand for nothing.
@@ -174,6 +174,7 @@
   let unsaved = false;
   // What was said on this page since it last saved: others may have said more of the rest by now.
   const said = new Map();
+  const VERDICTS = { '': 'none yet', accept: 'accepted', reject: 'rejected' };
   const judged = (prim) => review.get(prim) || { verdict: '', comment: '', directive: '' };
   const encoded = (linear) => {
     const value = Math.min(Math.max(linear, 0), 1);
@@ -282,9 +283,8 @@
 
   function showVerdict(entry) {
     const { verdict, directive, comment } = judged(entry.one.prim);
-    const words = { accept: 'accepted', reject: 'rejected' };
     entry.verdict.replaceChildren(
-      el('span', { class: `status ${verdict || 'none'}` }, words[verdict] || 'none yet'),
+      el('span', { class: `status ${verdict || 'none'}` }, VERDICTS[verdict] || verdict),
       ...(directive ? [el('span', { class: 'soft' }, ` (${directive})`)] : []),
       ...(comment ? [el('span', { class: 'soft' }, ' with a comment')] : []),
       ...(changed[entry.one.prim] ? [el('div', { class: 'soft' }, 'changed since')] : []));
@@ -437,32 +437,40 @@
   }
 
   const there = new Set(data.objects.map((one) => one.prim));
-  const strangers = () => [...review].filter(([prim, now]) =>
-    !there.has(prim) && (now.verdict || now.comment || now.directive));
+  const saysSomething = (one) => Boolean(one.verdict || one.comment || one.directive);
+  const strangers = () => [...review].filter(([prim, now]) => !there.has(prim) && saysSomething(now));
 
   /* What was said of objects that were taken out of the capture since: no row has it. */
   function gone() {
-    const left = strangers();
-    if (!left.length) return;
-    const items = left.map(([prim, now]) => {
-      const told = [now.verdict, now.directive && `for the next run ${now.directive}`, now.comment];
-      const takeBack = el('button', {
-        type: 'button', 'aria-label': `Take back what was said of ${prim}`,
-        onclick: () => {
-          const nothing = { verdict: '', comment: '', directive: '' };
-          review.set(prim, nothing);
-          said.set(prim, nothing);
-          unsaved = true;
-          $('saved').textContent = 'not saved yet';
-          takeBack.replaceWith('taken back');
-        },
-      }, 'Take back');
-      return el('li', {}, el('code', {}, prim), `: ${told.filter(Boolean).join('; ')} `, takeBack);
-    });
-    $('gone').append(
-      el('h3', {}, 'Said of what is no object here'),
-      el('p', { class: 'soft' }, 'It was judged once, and the capture has it no more. Runs pass it over.'),
-      el('ul', {}, ...items));
+    const left = Object.entries(data.review || {}).filter(([prim, was]) => !there.has(prim) && saysSomething(was));
+    $('gone').replaceChildren(...(left.length ? [
+      el('h3', {}, 'Said of objects that are gone'),
+      el('p', { class: 'soft' }, 'They were judged once, and the capture has them no more, or under other names. Runs pass them over.'),
+      el('ul', {}, ...left.map(([prim, was]) => goneItem(prim, was)))] : []));
+  }
+
+  function goneItem(prim, was) {
+    const button = el('button', { type: 'button', onclick: () => {
+      const now = saysSomething(judged(prim)) ? { verdict: '', comment: '', directive: '' } : was;
+      review.set(prim, now);
+      if (now === was) said.delete(prim); else said.set(prim, now);
+      unsaved = said.size > 0;
+      $('saved').textContent = unsaved ? 'not saved yet' : '';
+      show();
+    } });
+    const item = el('li', {}, el('div', { class: 'bar' },
+      el('code', {}, prim),
+      was.verdict ? el('span', { class: `status ${was.verdict}` }, VERDICTS[was.verdict] || was.verdict) : null,
+      was.directive ? el('span', {}, `for the next run: ${was.directive}`) : null, button),
+    was.comment ? el('p', {}, was.comment) : null);
+    function show() {
+      const kept = saysSomething(judged(prim));
+      item.classList.toggle('taken', !kept);
+      button.textContent = kept ? 'Take back' : 'Taken back: undo';
+      button.setAttribute('aria-label', `${kept ? 'Take back' : 'Taken back: undo of'} what was said of ${prim}`);
+    }
+    show();
+    return item;
   }
 
   const escaped = (text) => text.replace(/\\/g, '\\\\').replace(/"/g, '\\"').replace(/\r/g, '').replace(/\n/g, '\\n');
@@ -472,7 +480,7 @@
     const tree = {};
     for (const one of [...data.objects, ...strangers().map(([prim]) => ({ prim }))]) {
       const now = judged(one.prim), { verdict, comment, directive } = now;
-      if (!(verdict || comment || directive)) continue;
+      if (!saysSomething(now)) continue;
       const { status, phi, psi } = 'status' in now ? now : { ...one, status: one.fit };
       let node = tree;
       for (const part of one.prim.split('/').filter(Boolean)) node = (node[part] ??= {});
@@ -495,7 +503,7 @@
   }
 
   async function save() {
-    if (data.served) {
+    if (data.served && !data.published) {
       const sent = [...said];
       const answer = await fetch(data.served, {
         method: 'POST', headers: { 'Content-Type': 'application/json' },
@@ -506,7 +514,12 @@
         return;
       }
       $('saved').textContent = 'saved in review.usda';
-      for (const [prim, words] of sent) if (said.get(prim) === words) said.delete(prim);
+      for (const [prim, words] of sent) {
+        if (said.get(prim) === words) said.delete(prim);
+        // Nobody can say anything of it any more.
+        if (!there.has(prim) && !saysSomething(words)) delete data.review[prim];
+      }
+      gone();
       unsaved = said.size > 0;
       return;
     } else {
@@ -514,7 +527,7 @@
         href: URL.createObjectURL(new Blob([layer()], { type: 'text/plain' })), download: 'review.usda',
       });
       link.click();
-      $('saved').textContent = 'review.usda was handed to you: put it beside edits.usda';
+      $('saved').textContent = `review.usda was handed to you: put it beside edits.usda${data.published ? ' of the asset that this version was published from' : ''}`;
     }
     unsaved = false;
   }
@@ -603,7 +616,7 @@
   /* --- Room ---------------------------------------------------------------------------------- */
 
   function colours() {
-    const status = { measured: [0, 0.34, 0.17], prior: [0.79, 0.35, 0], unseen: [0.3, 0.3, 0.3], failed: [0.66, 0.11, 0], lamp: [0.87, 0.77, 0.05] };
+    const status = { measured: [0, 0.34, 0.17], bounded: [0.09, 0.46, 0.81], undetermined: [0.79, 0.35, 0], unseen: [0.3, 0.3, 0.3], failed: [0.66, 0.11, 0], lamp: [0.87, 0.77, 0.05] };
     const verdicts = { accept: [0, 0.34, 0.17], reject: [0.66, 0.11, 0] };
     const number = (value) => (value === null ? [0.3, 0, 0.3]
       : ramp(value).match(/\d+/g).map((byte) => (Number(byte) / 255) ** 2.2));
