@@ -359,6 +359,7 @@ ENGINEERING: dict[str, str] = {
     "_OF_PATTERNS": "bytes",
     "_OF_REFINING": "bytes",
     "_OF_TEXEL": "mathematics: variance of a texel",
+    "_OF_TWO": "mathematics: Student's t with one degree of freedom",
     "_ON_IT": "which of two readings of a format",
     "_OPEN": "rays: noise against time",
     "_OPENGL": "convention of a format",

@@ -32,6 +32,10 @@ _TOLD = calibration.number("similarity.told")
 _SURE = calibration.number("similarity.sure")
 _LEFT = calibration.number("similarity.left")
 
+# Student's t with one degree of freedom lies within so many of half the difference of two numbers
+# as often as a Gaussian's within one standard deviation.
+_OF_TWO = 1.84
+
 Vector = tuple[float, float, float]
 
 
@@ -177,7 +181,7 @@ def said_of_similarity(check: SimilarityCheck, source: Path, millimetres: float)
 
     millimetres  of a unit of the mesh
     """
-    found, off = check.found.change, check.off
+    found, off = check.found.change, _OF_TWO * check.off
     x, y, z = (millimetres * found.reach * np.array(found.move)).tolist()
     turn = np.degrees(found.turn)
     angle = float(np.linalg.norm(turn))
@@ -186,7 +190,7 @@ def said_of_similarity(check: SimilarityCheck, source: Path, millimetres: float)
     off_move = millimetres * found.reach * float(np.linalg.norm(off[4:]))
     return (
         f"{source.name}: frames show points of the mesh {check.found.moved:.1%} of a picture's "
-        f"width (error {check.error:.1%}) from where their poses have them; the poses fit the mesh "
+        f"width (error {_OF_TWO * check.error:.1%}) from where their poses have them; the poses fit the mesh "
         f"better if moved by ({x:+.0f}, {y:+.0f}, {z:+.0f}) mm (error {off_move:.0f}), turned by "
         f"{angle:.2f} degrees (error {off_turn:.2f}) about ({axis}) and "
         f"scaled by {math.exp(found.larger):.4f} (error {abs(off[0]):.4f}), about the cameras' "
