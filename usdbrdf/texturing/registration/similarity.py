@@ -191,8 +191,8 @@ def said_of_similarity(check: SimilarityCheck, source: Path, millimetres: float)
     return (
         f"{source.name}: frames show points of the mesh {check.found.moved:.1%} of a picture's "
         f"width (error {_OF_TWO * check.error:.1%}) from where their poses have them; the poses "
-        f"fit the mesh better if moved by ({x:+.0f}, {y:+.0f}, {z:+.0f}) mm (error {off_move:.0f}), turned by "
-        f"{angle:.2f} degrees (error {off_turn:.2f}) about ({axis}) and "
+        f"fit the mesh better if moved by ({x:+.0f}, {y:+.0f}, {z:+.0f}) mm (error {off_move:.0f})"
+        f", turned by {angle:.2f} degrees (error {off_turn:.2f}) about ({axis}) and "
         f"scaled by {math.exp(found.larger):.4f} (error {abs(off[0]):.4f}), about the cameras' "
         "middle. Align poses and mesh anew, or bring both as one program wrote them, in one unit. "
         "[capture.registration]"
