@@ -15,7 +15,7 @@ _WORDS = {
     "lamp": ("lamps", ""),
     "unfitted": ("not fitted, as a person asked", ""),
     "pane": ("panes before the outside", ""),
-    "bounded": ("without a highlight", ""),
+    "bounded": ("bounded", ""),
     "undetermined": ("not determined", "frames that see highlights on them would tell"),
     "unseen": ("unseen", "frames show too little of them: all about them but a colour is a guess"),
     "failed": ("failed", "the target frame does not determine them"),

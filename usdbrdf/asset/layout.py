@@ -14,6 +14,7 @@ from typing import Any
 from pxr import Sdf, Tf
 
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
+from usdbrdf.files.documents import read_json
 from usdbrdf.files.naming import identifier_from
 from usdbrdf.job.stamp import read_stamp, stamp_path
 
@@ -39,10 +40,22 @@ def version_around(place: Path) -> Path | None:
         (
             folder
             for folder in (inner, *inner.parents)
-            if VERSION.fullmatch(folder.name) and os.path.isfile(folder / MANIFEST)
+            if VERSION.fullmatch(folder.name) and _is_our_manifest(folder / MANIFEST)
         ),
         None,
     )
+
+
+def _is_our_manifest(file: Path) -> bool:
+    """Whether it has the entries of one, for those of other programs are called so too; or had
+    them, if it is damaged."""
+    if not os.path.isfile(file):
+        return False
+    try:
+        record = read_json(file)
+    except InputRefused:
+        return True
+    return isinstance(record, dict) and {"schema", "check", "files"} <= record.keys()
 
 
 @dataclass(frozen=True)

@@ -351,7 +351,7 @@ class FittedObject(MeasuredObject):
     psi_error: Annotated[float, Fact(FIT, "psiError", "float", 0.0, """Standard deviation of psi,
         errors of the model included; without unit.""", low=0)] = math.nan
     psi_upper: Annotated[float, Fact(FIT, "psiUpper95", "float", 1.0, """What psi exceeds with a
-        probability of 5 %, with no highlight too; without unit.""", low=0, high=1)] = math.nan
+        probability of 5 %, highlight or none; without unit.""", low=0, high=1)] = math.nan
     shown_phi: Annotated[float, Fact(FIT, "shownPhi", "float", 0.5, """The phi that the material
         shows in place of the measurement, where it is authored: what is usual for the object's
         class (option --unmeasured class); without unit.""", low=0, high=1)] = math.nan
@@ -368,7 +368,7 @@ class FittedObject(MeasuredObject):
         facets after Beckmann. Either all objects of an asset have the paper's or none has.""",
         tokens=("paper", "microfacet", "beckmann"))] = "paper"
     model: Annotated[str, Fact(FIT, "model", "token", "dielectric", """dielectric: a diffuse colour
-        under a lobe; diffuse: a colour alone, without evidence of more; conductor: a metal, a lobe
+        under a lobe; diffuse: a colour alone, no lobe being found; conductor: a metal, a lobe
         alone whose reflectance differs by channel; transparent: clear glass, not fitted.""",
         formerly="kind", tokens=_MODELS)] = "dielectric"
     directive: Annotated[str, Fact(FIT, "directive", "token", "", """What a person asked of the fit,
@@ -394,17 +394,17 @@ class FittedObject(MeasuredObject):
         where it is too large for a surface, and things are seen through or in it; without unit.""",
         low=0)] = math.nan
     status: Annotated[str, Fact(FIT, "status", "token", "unseen", """measured: phi and psi come from
-        the photographs, and their stated errors are small; bounded: no highlight shows though one
-        would, so that psi is below psiUpper95; undetermined: they say less. Of these two the values
-        are the medians of what remains likely if all was equally likely before. unseen: no
-        photograph shows enough of the object; failed: of method paper, whose minimum is kept
+        the photographs, and their stated errors are small; bounded: they do not determine
+        both, but psi lies below psiUpper95, less than 0.5; undetermined: they say less. Of these
+        what is not determined is the median of all that remains likely. unseen: no photograph
+        shows enough of the object; failed: of method paper, whose minimum is kept
         though the photograph does not determine it.""", tokens=_STATUSES,
         read=lambda status: "undetermined" if status == "prior" else status)]
     target_frame: Annotated[int, Fact(FIT, "targetFrame", "int", -1, """Index of the photograph that
         shows the highlight best, counted from 0 (time code minus 1); -1 for none.""", low=-1)]
     num_pixels: Annotated[int, Fact(FIT, "numPixels", "int", 0, """Number of pixels that the fit
         used.""", low=0)]
-    method: Annotated[str, Fact(FIT, "method", "token", "", """How it was fitted, as of --fit.""")]
+    method: Annotated[str, Fact(FIT, "method", "token", "", """The fit, as --fit names it: a word.""")]
     mapping: Annotated[str, Fact(FIT, "mapping", "token", "measured", """How UsdPreviewSurface was
         derived from phi and psi. measured: literally, roughness = sqrt(max(0.001, phi)), F0 = 0.08
         psi. matched: the reflectance and a factor on the diffuse colour were refitted, so that

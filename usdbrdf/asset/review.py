@@ -30,7 +30,7 @@ from usdbrdf.asset.readers.scene import read_fit, read_shading
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.files.documents import read_text
-from usdbrdf.model.mesh import DIRECTIVES, OF_SHADE
+from usdbrdf.model.mesh import DIRECTIVES, IN_PART, OF_SHADE
 
 VERDICTS = ("accept", "reject")
 MAX_COMMENT = 2000
@@ -38,9 +38,12 @@ MAX_COMMENT = 2000
 _LARGEST, _DEEPEST = 8 << 20, 200
 _STRING = re.compile(r'"""(?:\\.|[^\\])*?"""|"(?:\\.|[^"\\])*"', re.DOTALL)
 _VERSION = "1"  # of what is written, not of the program
+# A status as older versions called it, of what is bounded or undetermined now.
+_OLDER = "prior"
 _WORDS = {
     "accept": "accepted", "reject": "rejected", "": "judged",
-    "measured": "measured", "bounded": "without a highlight", "undetermined": "not determined",
+    "measured": "measured", "bounded": "bounded", "undetermined": "not determined",
+    _OLDER: "not determined",
 }  # fmt: skip
 
 
@@ -77,7 +80,8 @@ class Judgement:
     def change(self, fit: FittedObject | None) -> str:
         """What became of the object since, in words; "" where its numbers are those judged."""
         now = judged_as(fit)
-        same = self.status == now.status and all(
+        alike = self.status == now.status or (self.status == _OLDER and now.status in IN_PART)
+        same = alike and all(
             _shown(getattr(self, name)) == _shown(getattr(now, name)) for name in ("phi", "psi")
         )
         if not self.says_something or same:
@@ -164,8 +168,6 @@ def _judgement(said: Any, subject: str) -> Judgement:
             )
         if value is not None:
             known[item.name] = float(value) if number else value
-    if known.get("status") == "prior":  # as older versions called it
-        known["status"] = "undetermined"
     return Judgement(**known)
 
 

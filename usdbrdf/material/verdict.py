@@ -229,7 +229,7 @@ def verdict_on_views(lobe: LobeEstimate | None, seen: bool) -> Verdict:
     What the frames determine is published as found. Of a highlight that is hardly larger than the
     samples' footprint they say something, but the stated error includes what the footprint may have
     done. Where they do not determine both numbers, the medians of what remains likely are
-    published: no highlight is knowledge too, which bounds psi where one would have shown.
+    published, and psi is bounded where it lies in the lower half: no highlight is knowledge too.
     What is seen through a thing, or in it, changes with the view as no lobe does: then the numbers
     are none of a surface's and not measured; they stay, for what shows resembles the views more
     than what has no lobe. Names and classes of objects tell nothing here.
@@ -315,5 +315,4 @@ def verdict_on_frame(
 
 def _not_asked(seen: bool) -> Verdict:
     errors = float(NOTHING_KNOWN), UNASKED
-    status, model = "undetermined" if seen else "unseen", _model_of(NEUTRAL[1])
-    return Verdict(*NEUTRAL, *errors, status, psi_upper=1.0, model=model)
+    return Verdict(*NEUTRAL, *errors, "undetermined" if seen else "unseen", psi_upper=1.0)

@@ -164,13 +164,13 @@ def findings(
         )
     if bounded := count.get("bounded"):
         told.append(
-            f"{bounded} {_by_count(bounded, 'reflects', 'reflect')} little: no photograph shows a "
-            "highlight where a glossier surface would show one, which bounds the specular number."
+            f"{bounded} {_by_count(bounded, 'is', 'are')} bounded: photographs do not determine both "
+            "numbers, but hold the specular one below a bound."
         )
     if unknown := count.get("undetermined"):
         told.append(
             f"{unknown} {_by_count(unknown, 'is', 'are')} not determined: no photograph shows a "
-            "clear highlight, or could, so the numbers are what remains likely."
+            "clear highlight, so the numbers are what remains likely."
         )
     if sparse := count.get("sparse"):
         told.append(

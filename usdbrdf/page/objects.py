@@ -115,7 +115,7 @@ def _numbers(
         "status": status,
         "because": undetermined_because(fit, status, in_sight=in_sight),
         "fit": fit.status,
-        "model": fit.model,
+        "material": fit.model,
         "directive": fit.directive or (shading.directive if shading else ""),
         "phi": finite(fit.phi, 4),
         "phi_error": finite(fit.phi_error, 4),

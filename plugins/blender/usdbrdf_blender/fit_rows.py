@@ -5,7 +5,7 @@ The usdview and the Blender plug-in are installed apart: each has its copy of th
 
 _STATUS = {
     "measured": "MEASURED in the photographs",
-    "bounded": "BOUNDED, not measured: no highlight, though one of a glossier surface would show",
+    "bounded": "BOUNDED, not measured: the photographs hold psi below a bound",
     "undetermined": "UNDETERMINED, not measured: what remains likely by the photographs",
     "unseen": "UNSEEN, not measured: no photograph shows enough of the object",
     "failed": "FAILED, not measured: the photograph does not determine the values",

@@ -21,9 +21,10 @@
   const percent = (value, digits = 1) => (value === null ? '\u2013' : `${(100 * value).toFixed(digits)} %`);
   const metres = (value) => `${value.toFixed(2)} m`;
   const STATUS = {
-    measured: 'measured', bounded: 'no highlight', undetermined: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
+    measured: 'measured', bounded: 'bounded', undetermined: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
     sparse: 'too few pixels', contradicted: 'seen through', pane: 'clear glass', told: 'left out', glimpsed: 'hardly shown',
   };
+  const MATERIAL = { dielectric: 'a colour under a gloss', diffuse: 'a colour alone', conductor: 'a metal' };
   // Nothing was fitted of these: the numbers that they carry stand for nothing.
   const UNFITTED = ['lamp', 'pane', 'told'];
 
@@ -172,6 +173,8 @@
   const review = new Map(Object.entries(data.review || {}));
   const changed = data.changed || {};
   let unsaved = false;
+  // Whether a layer was handed over, which knows nothing of what is said after it.
+  let handed = false;
   // What was said on this page since it last saved: others may have said more of the rest by now.
   const said = new Map();
   const VERDICTS = { '': 'none yet', accept: 'accepted', reject: 'rejected' };
@@ -202,7 +205,7 @@
 
   /* What the words of the trade say, for who judges without them. */
   const WORDS = {
-    Status: 'measured: the photographs determine roughness and specular. Not determined: no photograph shows a clear enough highlight, and the grey numbers are what remains likely. Unseen: no photograph shows enough of the object to measure anything; hardly shown: only together with what is beside it; too few pixels: enough for a colour, not for more. Seen through: its views contradict that it is a surface; clear glass: photographs show the outside through it. Left out: a person said that nothing be fitted, by ignore or glass.',
+    Status: 'measured: the photographs determine roughness and specular. Bounded: they do not determine both, but hold specular below the number that is told. Not determined: no photograph shows a clear enough highlight. Of both, grey numbers are what remains likely. Unseen: no photograph shows enough of the object to measure anything; hardly shown: only together with what is beside it; too few pixels: enough for a colour, not for more. Seen through: its views contradict that it is a surface; clear glass: photographs show the outside through it. Left out: a person said that nothing be fitted, by ignore or glass.',
     Colour: 'the mean of the base colour: what the object reflects to all sides, without highlights and without the light that fell on it.',
     'Roughness \u03c6': 'how wide highlights are: 0 a mirror, 1 matt (alpha of the GGX distribution; the roughness of most renderers is its square root). \u00b1: one standard deviation.',
     'Specular \u03c8': 'how strong they are: 0.5 is usual for wood, paint and plastics, 0 has none (what is mirrored straight ahead is 0.08 \u03c8 of the light). Of metals a colour, F0, takes its place.',
@@ -318,6 +321,7 @@
       fact('Evidence', one.evidence === null ? '\u2013' : percent(one.evidence));
       if (one.base_color) fact('Base colour', `${one.base_color.map((value) => fixed(value, 3)).join(', ')} (linear)`);
     }
+    if (MATERIAL[one.material] && !UNFITTED.includes(one.because) && one.status !== 'unseen') fact('Material', MATERIAL[one.material]);
     fact('Class', one.class || 'none');
     fact('Area', `${one.area.toFixed(2)} m\u00b2, ${percent(one.seen)} seen, ${percent(one.clipped, 2)} clipped everywhere`);
     fact('Prim', one.prim);
@@ -453,7 +457,7 @@
     const button = el('button', { type: 'button', onclick: () => {
       const now = saysSomething(judged(prim)) ? { verdict: '', comment: '', directive: '' } : was;
       review.set(prim, now);
-      if (now === was) said.delete(prim); else said.set(prim, now);
+      if (now === was && !handed) said.delete(prim); else said.set(prim, now);
       unsaved = said.size > 0;
       $('saved').textContent = unsaved ? 'not saved yet' : '';
       show();
@@ -527,6 +531,7 @@
         href: URL.createObjectURL(new Blob([layer()], { type: 'text/plain' })), download: 'review.usda',
       });
       link.click();
+      handed = true;
       $('saved').textContent = `review.usda was handed to you: put it beside edits.usda${data.published ? ' of the asset that this version was published from' : ''}`;
     }
     unsaved = false;
