@@ -336,4 +336,6 @@ def test_what_an_older_version_called_otherwise_is_read_and_valid(built):
     scene = AssetStage(stage)
     assert not [*allowed_tokens.check(scene), *undeclared_attribute.check(scene)]
     older = {"verdict": "accept", "status": "prior", "phi": found.phi, "psi": found.psi}
-    assert _judgement(older, "<chair>").change(found) == ""
+    for now in ("undetermined", "bounded"):
+        assert _judgement(older, "<chair>").change(replace(found, status=now)) == ""
+    assert _judgement(older, "<chair>").change(replace(found, status="measured"))

@@ -20,7 +20,7 @@ from tests.json_schemas import check
 from tests.validation.faults import SURFACE, edited
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layers.scan_layer import write_pending_layer
-from usdbrdf.asset.layout import Asset
+from usdbrdf.asset.layout import Asset, version_around
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
 from usdbrdf.asset.readers import tried
 from usdbrdf.asset.review import write_review
@@ -326,6 +326,14 @@ def test_what_an_artist_changed_is_theirs_in_a_version_too(room, tmp_path):
     publish(room.asset.folder, tmp_path)
     for asset in (room.asset, Asset.made(tmp_path / "v001")):
         assert own_findings(Usd.Stage.Open(str(asset.root_layer))) == []
+
+
+def test_a_shot_of_other_programs_with_a_manifest_of_theirs_is_no_version(room, tmp_path):
+    shot = tmp_path / "v012"
+    shot.mkdir()
+    for text, ours in (('{"show": "x"}', False), ('{"files": {}, "schema"', True)):
+        (shot / "manifest.json").write_text(text)
+        assert (version_around(shot / "study") == shot) is ours
 
 
 def test_nothing_of_any_asset_is_written_into_a_version(room, tmp_path):

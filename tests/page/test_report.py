@@ -18,6 +18,7 @@ from pxr import Usd
 import usdbrdf
 from tests.page.conftest import data_of, fit_of
 from usdbrdf.asset.maps import camera_hits
+from usdbrdf.asset.readers.scene import read_fit
 from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, UsageError
 from usdbrdf.evaluation.evaluate_views import MODELS, ScoredView, measured_atlas, viewed_asset
 from usdbrdf.model.material import turned_up
@@ -72,6 +73,15 @@ def test_frames_views_and_maps_are_there(room, page_file):
         *("lit", "coverage", "samples", "spread", "stderr", "irradiance", "albedo", "phi", "psi")
     }
     assert all(len(shown["pictures"]) == len(data["views"]) for shown in data["maps"])
+
+
+def test_no_word_about_an_object_passes_for_a_picture_of_it(room):
+    """Which those that no photograph shows have none of."""
+    _, atlas = measured_atlas(room.asset)
+    obj = atlas.scene.objects[0]
+    told = objects._numbers(atlas, 0, obj, read_fit(atlas.stage, obj.prim_path), False)
+    assert not {"frame", "photograph", "model"} & told.keys()
+    assert told["material"] in ("dielectric", "diffuse")
 
 
 def test_the_room_opens_as_one_of_the_frames_looks(room, page_file):

@@ -12,7 +12,7 @@ from tests.physics.surfaces import Part, World, quad, room, world_of
 from usdbrdf.model.texels import CoverageMap
 from usdbrdf.shading import clipped_groups as groups_of_clipped
 from usdbrdf.shading.clipped_emitters import EstimatedRadiance
-from usdbrdf.shading.clipped_groups import clipped_groups
+from usdbrdf.shading.clipped_groups import clipped_groups, hardly_shown
 from usdbrdf.shading.clipped_light import lamps_with_unseen
 
 WALL, LAMP = 2, 6
@@ -86,19 +86,25 @@ def test_a_clipped_lamp_is_one_group_with_what_nobody_saw_of_it(world: World, ow
     np.testing.assert_array_equal(np.flatnonzero(found.group == 0), lamp)
 
 
-@pytest.mark.parametrize("clipped", [15, 3])
-def test_few_texels_that_clip_may_be_a_lamp_where_no_other_is_seen(world: World, own, clipped: int):
+def test_a_lamp_of_which_few_texels_clip_is_one_where_no_other_is_seen(world: World, own):
     lit = world.per_object([(0.2, 0.2, 0.2)] * 6 + [(0.1 * BOUND,) * 3])
     lamp = own(LAMP)
-    found = _groups(world, lit, lamp[:clipped], unseen=lamp[clipped:])
-    assert found.lamp.tolist() == found.small.tolist() == [True]
+    found = _groups(world, lit, lamp[:15], unseen=lamp[15:])
+    np.testing.assert_array_equal(found.lamp, [True])
     np.testing.assert_array_equal(np.flatnonzero(found.group == 0), lamp)
 
 
-def test_a_glint_beside_what_is_measured_is_none_but_where_a_person_says_so(world: World, own):
+@pytest.mark.parametrize(("clipped", "measured"), [(3, 0), (15, 1)])
+def test_a_glint_is_not_all_that_an_object_is_but_where_a_person_says_so(
+    world: World, own, clipped: int, measured: int
+):
     lit = world.per_object([(0.2, 0.2, 0.2)] * 6 + [(0.1 * BOUND,) * 3])
     lamp = own(LAMP)
-    coverage = _coverage(lit, lamp[:15], unseen=lamp[16:])
+    coverage = _coverage(lit, lamp[:clipped], unseen=lamp[clipped + measured :])
+    spots = hardly_shown(world.texels, coverage, {})
+    assert spots.tolist() == ([] if measured else [LAMP])
+    assert len(clipped_groups(world.texels, lit, coverage, {}, spots)) == len(spots)
+    assert not len(hardly_shown(world.texels, coverage, {LAMP: False}))
     assert len(clipped_groups(world.texels, lit, coverage)) == 0
     assert len(clipped_groups(world.texels, lit, coverage, {LAMP: False})) == 0
     found = clipped_groups(world.texels, lit, coverage, {LAMP: True})

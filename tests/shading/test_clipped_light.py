@@ -193,19 +193,50 @@ def test_the_lamps_are_as_bright_as_their_light_says(
         assert np.abs(np.log(found / expected)).max() < error
 
 
-def test_a_lamp_is_as_bright_as_its_light_says_where_next_to_nothing_of_it_is_seen(
-    world: World, truth: np.ndarray, tmp_path: Path
-):
-    """Three of its texels, as of a spot that is seen from the side."""
-    owner = world.texels.object_index()
-    own, clipped = np.flatnonzero(owner == 6), (truth >= SATURATION).any(axis=1)
+def _with_thing_of_which_three_texels_clip(
+    world: World,
+    albedo: list[tuple[float, float, float]],
+    emitted: list[tuple[float, float, float]],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """L_d, what clips in it and what is seen, where nothing else is seen of the last object."""
+    noise = np.exp(0.03 * np.random.default_rng(5).standard_normal((len(world.texels), 1)))
+    lit = _shone(
+        world, (world.per_object(albedo) * noise).astype(np.float32), world.per_object(emitted), 4
+    )
+    own = np.flatnonzero(world.texels.object_index() == len(albedo) - 1)
+    lit[own] = SATURATION
+    clipped = (lit >= SATURATION).any(axis=1)
+    seen = ~clipped
     clipped[own[3:]] = False
-    seen = ~clipped & (owner != 6)
-    lit = np.where((clipped | (owner == 6))[:, None], np.float32(SATURATION), truth)
+    return np.where(clipped[:, None], np.float32(SATURATION), lit), clipped, seen
+
+
+def test_a_spot_is_as_bright_as_its_light_says_where_next_to_nothing_of_it_is_seen(
+    world: World, tmp_path: Path
+):
+    """Three texels, as from the side."""
+    shines = (60.0, 50.0, 40.0)
+    given = [*ALBEDO, (0, 0, 0), (0, 0, 0)], [(0, 0, 0)] * 6 + [LAMPS[1], shines]
+    lit, clipped, seen = _with_thing_of_which_three_texels_clip(world, *given)
     light = _estimated(world, lit, clipped, tmp_path, seen=seen)
-    assert light.groups.small[light.groups.object == 6].tolist() == [True]
-    found = light.lit[own].mean(axis=0)
-    assert np.abs(np.log(found / LAMPS[0])).max() < light.error_of_object(6) < 0.5
+    assert light.groups.small[light.groups.object == 7].tolist() == [True]
+    found = light.lit[world.texels.of_object(7)].mean(axis=0)
+    assert np.abs(np.log(found / shines)).max() < 0.25
+
+
+@pytest.mark.parametrize(
+    ("place", "size"), [((1.2, 1.2, 2.0), 0.1), ((2.0, 1.5, 0.8), 0.2)], ids=["below", "far"]
+)
+def test_a_glint_is_no_spot(place: tuple[float, float, float], size: float, tmp_path: Path):
+    """On a thing that is grey, below a lamp or in the middle of the room."""
+    lamp = quad((1, 1, 2.3), (0, 0.4, 0), (0.4, 0, 0))
+    knob = quad(place, (0, 0, size), (0, size, 0), size=(10, 10))
+    here = world_of([*room((0, 0, 0), (4, 3, 2.5), size=(20, 20)), lamp, knob])
+    given = [*ALBEDO, (0, 0, 0), (0.7, 0.7, 0.7)], [(0, 0, 0)] * 6 + [LAMPS[0], (0, 0, 0)]
+    lit, clipped, seen = _with_thing_of_which_three_texels_clip(here, *given)
+    light = _estimated(here, lit, clipped, tmp_path, seen=seen)
+    assert light.groups.object.tolist() == [6]
+    assert light.estimate.determined.tolist() == [True]
 
 
 def test_light_that_did_not_clip_stays_as_it_is(world: World, truth: np.ndarray, tmp_path: Path):

@@ -404,7 +404,7 @@ class FittedObject(MeasuredObject):
         shows the highlight best, counted from 0 (time code minus 1); -1 for none.""", low=-1)]
     num_pixels: Annotated[int, Fact(FIT, "numPixels", "int", 0, """Number of pixels that the fit
         used.""", low=0)]
-    method: Annotated[str, Fact(FIT, "method", "token", "", """The fit, as --fit names it: a word.""")]
+    method: Annotated[str, Fact(FIT, "method", "token", "", """Kind of fit, as --fit spells it.""")]
     mapping: Annotated[str, Fact(FIT, "mapping", "token", "measured", """How UsdPreviewSurface was
         derived from phi and psi. measured: literally, roughness = sqrt(max(0.001, phi)), F0 = 0.08
         psi. matched: the reflectance and a factor on the diffuse colour were refitted, so that

@@ -164,8 +164,8 @@ def findings(
         )
     if bounded := count.get("bounded"):
         told.append(
-            f"{bounded} {_by_count(bounded, 'is', 'are')} bounded: photographs do not determine both "
-            "numbers, but hold the specular one below a bound."
+            f"{bounded} {_by_count(bounded, 'is', 'are')} bounded: photographs do not determine "
+            "both numbers, but hold the specular one below a bound."
         )
     if unknown := count.get("undetermined"):
         told.append(

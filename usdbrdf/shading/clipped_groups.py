@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -18,6 +18,7 @@ from usdbrdf.shading.clipped_emitters import LAMP_PRIOR
 from usdbrdf.shading.lamp_light import Lamps
 
 _MIN_TEXELS = calibration.count("lamps.min_texels")
+_SHOWN_OF_SMALL = calibration.number("lamps.shown_of_small")
 # More lamps are not told apart; the faintest keep their bounds.
 _MAX_GROUPS = 24
 _REACH = calibration.number("lamps.reach")
@@ -80,11 +81,12 @@ def clipped_groups(
     radiance: Float,
     coverage: CoverageMap,
     said: Mapping[int, bool] = MappingProxyType({}),
+    hardly_shown: Collection[int] = (),
 ) -> ClippedGroups:
     """An object more than half of whose observed area clipped is one group, with what nobody saw
     of it; on others each connected part is one. Few texels are none, unless they are all that was
-    seen of an object, or a person says that it is a lamp: whether they are a lamp or a glint is
-    told by the light that they cast.
+    seen of an object, and enough of it, or it is one of those ``hardly_shown``, or a person says
+    that it is a lamp.
 
     radiance (T, 3): L_d, a lower bound where ``coverage`` says clipped
     said     of objects whether they are lamps, where that is known
@@ -98,7 +100,8 @@ def clipped_groups(
         candidates, around = own[clipped[own]], own[measured[own]]
         shines = texels.area[candidates].sum()
         whole, small = shines > texels.area[around].sum(), len(candidates) < _MIN_TEXELS
-        if small and not (whole and said.get(i, not len(around))):
+        shown = not len(around) and shines > _SHOWN_OF_SMALL * texels.area[own].sum()
+        if small and not (whole and said.get(i, shown or i in hardly_shown)):
             continue
         parts = [own[~measured[own]]] if whole else _connected(texels, candidates)
         for part in parts:
@@ -126,6 +129,22 @@ def clipped_groups(
         small=np.array([item[4] for item in found], np.bool_),
         wall=wall,
     )
+
+
+def hardly_shown(texels: Texels, coverage: CoverageMap, said: Mapping[int, bool]) -> Long:
+    """Numbers of the objects of which few texels clip and no others are seen, and hardly any of
+    it: spots seen from the side, or glints. None of those that are ``said`` to be lamps or not."""
+    owner, count = texels.object_index(), len(texels.resolution)
+    num_clipped, num_measured = (
+        np.bincount(owner[kind], minlength=count) for kind in (coverage.clipped, coverage.measured)
+    )
+    area, shines = (
+        np.bincount(owner, weights, count)
+        for weights in (texels.area, texels.area * coverage.clipped)
+    )
+    few = (num_clipped > 0) & (num_clipped < _MIN_TEXELS) & (num_measured == 0)
+    few[[*said]] = False
+    return np.flatnonzero(few & (shines <= _SHOWN_OF_SMALL * area))
 
 
 def _connected(texels: Texels, candidates: Long) -> list[Long]:

@@ -23,6 +23,7 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import Shining, asked_texels, first_of_segments, irradiance_of_texels
 from usdbrdf.shading.clipped_emitters import (
+    LAMP_PRIOR,
     LEAST_ERROR,
     MAX_ERROR,
     UNTOLD,
@@ -31,7 +32,7 @@ from usdbrdf.shading.clipped_emitters import (
     estimate_clipped_emitters,
     nothing_known,
 )
-from usdbrdf.shading.clipped_groups import ClippedGroups, clipped_groups, with_unseen
+from usdbrdf.shading.clipped_groups import ClippedGroups, clipped_groups, hardly_shown, with_unseen
 from usdbrdf.shading.gloss import mirrored_to_frames
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden, said_to_shine
 from usdbrdf.shading.lamp_light import looked_at_closely
@@ -130,14 +131,23 @@ def estimate_clipped_light(
     """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
     said: of objects whether they are lamps, where that is known. unseen (T,): the texels of lamps
     that no frame shows, whose radiance is in ``lit``; None without any."""
-    groups = clipped_groups(surface.texels, lit, coverage, said)
+
+    def weighed(groups: ClippedGroups) -> tuple[EstimatedRadiance, Bool]:
+        given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
+        return _Weighing(*given).told()
+
+    spots = hardly_shown(surface.texels, coverage, said)
+    if len(spots):
+        groups = clipped_groups(surface.texels, lit, coverage, said, spots)
+        asked_of = partial(_clear_lamps, groups, spots, weighed)
+        spots = run.checkpoint("hardly-shown", asked_of)["spot"]
+    groups = clipped_groups(surface.texels, lit, coverage, said, spots)
     if not groups.lamp.any():
         return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
-        given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
-        told, wall = _Weighing(*given).told()
+        told, wall = weighed(groups)
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
@@ -155,6 +165,20 @@ def estimate_clipped_light(
     lit = _with_estimates(lit, groups, estimate)
     estimate = replace(estimate, standard_error=np.hypot(estimate.standard_error, UNTOLD))
     return ClippedLight(lit=lit, groups=groups, estimate=estimate)
+
+
+def _clear_lamps(
+    groups: ClippedGroups,
+    spots: Long,
+    weighed: Callable[[ClippedGroups], tuple[EstimatedRadiance, Bool]],
+) -> dict[str, Array]:
+    """Which of the objects ``spots`` are lamps beyond doubt, by the light of all ``groups``: by all
+    likelihood brighter than one is expected to be before the evidence. A glint that takes up light
+    of which nothing else is known comes out few times as bright as frames clip."""
+    told, wall = weighed(groups)
+    clear = groups.lamp & told.determined & ~wall & np.isin(groups.object, spots)
+    clear &= np.log(told.least().max(axis=1)) > LAMP_PRIOR[0]
+    return {"spot": np.unique(groups.object[clear]).astype(np.int64)}
 
 
 @dataclass(frozen=True)
