@@ -132,22 +132,22 @@ def estimate_clipped_light(
     said: of objects whether they are lamps, where that is known. unseen (T,): the texels of lamps
     that no frame shows, whose radiance is in ``lit``; None without any."""
 
-    def weighed(groups: ClippedGroups) -> tuple[EstimatedRadiance, Bool]:
+    def weighing(groups: ClippedGroups) -> _Weighing:
         given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
-        return _Weighing(*given).told()
+        return _Weighing(*given)
 
     spots = hardly_shown(surface.texels, coverage, said)
     if len(spots):
-        groups = clipped_groups(surface.texels, lit, coverage, said, spots)
-        asked_of = partial(_clear_lamps, groups, spots, weighed)
-        spots = run.checkpoint("hardly-shown", asked_of)["spot"]
+        every = clipped_groups(surface.texels, lit, coverage, said, spots)
+        found = run.checkpoint("hardly-shown", lambda: {"spot": weighing(every).clear(spots)})
+        spots = found["spot"]
     groups = clipped_groups(surface.texels, lit, coverage, said, spots)
     if not groups.lamp.any():
         return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
-        told, wall = weighed(groups)
+        told, wall = weighing(groups).told()
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
@@ -165,20 +165,6 @@ def estimate_clipped_light(
     lit = _with_estimates(lit, groups, estimate)
     estimate = replace(estimate, standard_error=np.hypot(estimate.standard_error, UNTOLD))
     return ClippedLight(lit=lit, groups=groups, estimate=estimate)
-
-
-def _clear_lamps(
-    groups: ClippedGroups,
-    spots: Long,
-    weighed: Callable[[ClippedGroups], tuple[EstimatedRadiance, Bool]],
-) -> dict[str, Array]:
-    """Which of the objects ``spots`` are lamps beyond doubt, by the light of all ``groups``: by all
-    likelihood brighter than one is expected to be before the evidence. A glint that takes up light
-    of which nothing else is known comes out few times as bright as frames clip."""
-    told, wall = weighed(groups)
-    clear = groups.lamp & told.determined & ~wall & np.isin(groups.object, spots)
-    clear &= np.log(told.least().max(axis=1)) > LAMP_PRIOR[0]
-    return {"spot": np.unique(groups.object[clear]).astype(np.int64)}
 
 
 @dataclass(frozen=True)
@@ -216,6 +202,18 @@ class _Weighing:
             dark, own_seed = black_environment(), self.seed + int(k) + 1
             brought[k] = irradiance_of_texels(self.surface, light, dark, chosen, own_seed)
         return brought
+
+    def clear(self, spots: Long) -> Long:
+        """Which of the objects ``spots`` are lamps beyond doubt: by all likelihood brighter than
+        one is expected to be before the evidence. A glint that takes up light of which nothing else
+        is known comes out few times as bright as frames clip."""
+        groups = self.groups
+        if not len(self._chosen[0]):
+            return spots[:0]
+        told = estimate_clipped_emitters(self._evidence(self.lit, groups))
+        clear = told.determined & np.isin(groups.object, spots)
+        clear &= np.log(told.least().max(axis=1)) > LAMP_PRIOR[0]
+        return np.unique(groups.object[clear]).astype(np.int64)
 
     def told(self) -> tuple[EstimatedRadiance, Bool]:
         """The estimate, and which of the groups (K,) reflect the light of others than these."""
