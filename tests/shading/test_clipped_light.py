@@ -35,6 +35,18 @@ LAMPS = [(12.0, 10.0, 7.0), (5.0, 5.5, 6.5)]
 SATURATION = 3.0
 
 
+@pytest.fixture(autouse=True)
+def angles(monkeypatch) -> list[float]:
+    """Degrees between directions from which spots clip; these frames have no pictures."""
+    apart = [0.0]
+
+    def of_glare(_surface, _frames, index, _seed):
+        return np.full(len(index), apart[0])
+
+    monkeypatch.setattr(clipped_light, "angles_of_glare", of_glare)
+    return apart
+
+
 def _shone(
     world: World,
     albedo: np.ndarray,
@@ -212,9 +224,10 @@ def _with_thing_of_which_three_texels_clip(
 
 
 def test_a_spot_is_as_bright_as_its_light_says_where_next_to_nothing_of_it_is_seen(
-    world: World, tmp_path: Path
+    world: World, tmp_path: Path, angles: list[float]
 ):
     """Three texels, as from the side."""
+    angles[0] = 60.0
     shines = (60.0, 50.0, 40.0)
     given = [*ALBEDO, (0, 0, 0), (0, 0, 0)], [(0, 0, 0)] * 6 + [LAMPS[1], shines]
     lit, clipped, seen = _with_thing_of_which_three_texels_clip(world, *given)
@@ -228,7 +241,7 @@ def test_a_spot_is_as_bright_as_its_light_says_where_next_to_nothing_of_it_is_se
     ("place", "size"), [((1.2, 1.2, 2.0), 0.1), ((2.0, 1.5, 0.8), 0.2)], ids=["below", "far"]
 )
 def test_a_glint_is_no_spot(place: tuple[float, float, float], size: float, tmp_path: Path):
-    """On a thing that is grey, below a lamp or in the middle of the room."""
+    """On a thing that is grey, below a lamp or amid the room: it clips from one side alone."""
     lamp = quad((1, 1, 2.3), (0, 0.4, 0), (0.4, 0, 0))
     knob = quad(place, (0, 0, size), (0, size, 0), size=(10, 10))
     here = world_of([*room((0, 0, 0), (4, 3, 2.5), size=(20, 20)), lamp, knob])

@@ -10,7 +10,12 @@ import pytest
 from tests.physics.surfaces import box, quad, world_of
 from tests.scenes import frames_at, look_at
 from usdbrdf.shading import gloss
-from usdbrdf.shading.gloss import gloss_of_objects, mirrored_irradiance, mirrored_to_frames
+from usdbrdf.shading.gloss import (
+    angles_of_glare,
+    gloss_of_objects,
+    mirrored_irradiance,
+    mirrored_to_frames,
+)
 from usdbrdf.transport.brdf import DIELECTRIC, F0_OF_PSI
 from usdbrdf.transport.directional_albedo import fitted_albedo, view_cosines
 from usdbrdf.transport.environment import black_environment
@@ -110,6 +115,30 @@ def _photographs(surface: TexturedScene, light: np.ndarray):
         return SimpleNamespace(radiance=radiance, valid=~none, clipped=none, dark=none)
 
     return read
+
+
+def test_directions_from_which_something_clips_are_as_far_apart_as_the_frames_that_show_it(
+    lamplit, monkeypatch
+):
+    """Where only the frames at one side clip, a mirror image for all one knows."""
+    surface, light, frames = lamplit
+    read = _photographs(surface, light)
+    floor = np.flatnonzero(np.abs(surface.texels.position - [2.0, 2.0, 0.0]).max(axis=1) < 0.4)
+    angles = []
+    for clips in (range(12), (0, 1), ()):
+
+        def photograph(frames, i: int, clips=clips):
+            picture = read(frames, i)
+            picture.clipped = np.full(picture.valid.shape, i in clips)
+            picture.valid = ~picture.clipped
+            return picture
+
+        monkeypatch.setattr(gloss, "read_frame", photograph)
+        angles.append(angles_of_glare(surface, frames, floor, 0).max())
+    # Eyes 2 m above the floor on a circle of 1.4 m, 30 degrees apart.
+    assert 55 < angles[0] < 75
+    assert 10 < angles[1] < 25
+    assert angles[2] == 0
 
 
 def test_objects_are_as_glossy_as_their_views_tell(lamplit, monkeypatch):

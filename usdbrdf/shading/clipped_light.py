@@ -23,7 +23,6 @@ from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.shading.asked import Shining, asked_texels, first_of_segments, irradiance_of_texels
 from usdbrdf.shading.clipped_emitters import (
-    LAMP_PRIOR,
     LEAST_ERROR,
     MAX_ERROR,
     UNTOLD,
@@ -33,7 +32,7 @@ from usdbrdf.shading.clipped_emitters import (
     nothing_known,
 )
 from usdbrdf.shading.clipped_groups import ClippedGroups, clipped_groups, hardly_shown, with_unseen
-from usdbrdf.shading.gloss import mirrored_to_frames
+from usdbrdf.shading.gloss import angles_of_glare, mirrored_to_frames
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden, said_to_shine
 from usdbrdf.shading.lamp_light import looked_at_closely
 from usdbrdf.shading.outside_light import Asked
@@ -48,6 +47,7 @@ _TEXELS, _LEAST_OF_SEGMENT, _PER_SEGMENT, _SEGMENTS = 3000, 30, 150, 400
 _CLOSELY = 8
 # Texels of a part that are asked whether daylight explains them.
 _ASKED = 128
+_WIDER = calibration.number("lamps.wider_than_glints")
 _LEAST_OF_LIGHT = calibration.number("lamps.least_of_light")
 _SOME_EXPLAINED, _EXPLAINED = calibration.pair("lamps.explained_by_daylight")
 
@@ -131,23 +131,18 @@ def estimate_clipped_light(
     """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
     said: of objects whether they are lamps, where that is known. unseen (T,): the texels of lamps
     that no frame shows, whose radiance is in ``lit``; None without any."""
-
-    def weighing(groups: ClippedGroups) -> _Weighing:
-        given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
-        return _Weighing(*given)
-
     spots = hardly_shown(surface.texels, coverage, said)
     if len(spots):
-        every = clipped_groups(surface.texels, lit, coverage, said, spots)
-        found = run.checkpoint("hardly-shown", lambda: {"spot": weighing(every).clear(spots)})
-        spots = found["spot"]
+        given = surface, coverage, frames, spots, seed
+        spots = run.checkpoint("spots", lambda: {"spot": without_glints(*given)})["spot"]
     groups = clipped_groups(surface.texels, lit, coverage, said, spots)
     if not groups.lamp.any():
         return ClippedLight(lit=lit, groups=groups, estimate=nothing_known(len(groups)))
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
-        told, wall = weighing(groups).told()
+        given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
+        told, wall = _Weighing(*given).told()
         return {**vars(told), "wall": wall}
 
     found = dict(run.checkpoint("clipped", compute))
@@ -165,6 +160,17 @@ def estimate_clipped_light(
     lit = _with_estimates(lit, groups, estimate)
     estimate = replace(estimate, standard_error=np.hypot(estimate.standard_error, UNTOLD))
     return ClippedLight(lit=lit, groups=groups, estimate=estimate)
+
+
+def without_glints(
+    surface: TexturedScene, coverage: CoverageMap, frames: Frames, spots: Long, seed: int
+) -> Long:
+    """Those of the objects ``spots`` that shine to all sides: of which a texel clips in frames from
+    directions that are farther apart than those in which a mirror image of a lamp is seen."""
+    owner = surface.texels.object_index()
+    index = np.flatnonzero(np.isin(owner, spots) & coverage.clipped)
+    apart = angles_of_glare(surface, frames, index, seed)
+    return np.unique(owner[index[apart > _WIDER]]).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -202,18 +208,6 @@ class _Weighing:
             dark, own_seed = black_environment(), self.seed + int(k) + 1
             brought[k] = irradiance_of_texels(self.surface, light, dark, chosen, own_seed)
         return brought
-
-    def clear(self, spots: Long) -> Long:
-        """Which of the objects ``spots`` are lamps beyond doubt: by all likelihood brighter than
-        one is expected to be before the evidence. A glint that takes up light of which nothing else
-        is known comes out few times as bright as frames clip."""
-        groups = self.groups
-        if not len(self._chosen[0]):
-            return spots[:0]
-        told = estimate_clipped_emitters(self._evidence(self.lit, groups))
-        clear = told.determined & np.isin(groups.object, spots)
-        clear &= np.log(told.least().max(axis=1)) > LAMP_PRIOR[0]
-        return np.unique(groups.object[clear]).astype(np.int64)
 
     def told(self) -> tuple[EstimatedRadiance, Bool]:
         """The estimate, and which of the groups (K,) reflect the light of others than these."""

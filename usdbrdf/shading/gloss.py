@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
 from usdbrdf import calibration
 from usdbrdf.files.frames import read_frame, read_frames
@@ -20,7 +21,14 @@ from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.texturing.agreement import MeshPoints, seen_points
 from usdbrdf.texturing.observe import spread_order
-from usdbrdf.texturing.samples import SAMPLE, Picture, first_surfaces, samples_from_frame
+from usdbrdf.texturing.samples import (
+    CLIPPED,
+    NOTHING,
+    SAMPLE,
+    Picture,
+    first_surfaces,
+    samples_from_frame,
+)
 from usdbrdf.transport.brdf import DIELECTRIC
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import LitScene, TexturedScene, lit_scene, points_of_texels
@@ -155,22 +163,44 @@ def _slopes(
 
 
 def _seen_by(surface: TexturedScene, frames: Frames, index: Long, owner: Int, views: Int) -> Float:
-    """(_VIEWS, N, 3) W/(m^2 sr): what frames ``views`` (N, _VIEWS) show of the texels ``index``;
-    NaN where they show none of it."""
+    """(_VIEWS, N, 3): what frames ``views`` (N, _VIEWS) show of texels ``index`` (N,), NaN where
+    they show nothing."""
+    kind, shown = _samples_of(surface, frames, index, owner, views)
+    return np.where((kind == SAMPLE)[..., None], shown, np.float32(np.nan))
+
+
+def _samples_of(
+    surface: TexturedScene, frames: Frames, index: Long, owner: Int, views: Int
+) -> tuple[npt.NDArray[np.int8], Float]:
+    """(_VIEWS, N) and (_VIEWS, N, 3): as of ``samples_from_frame``, NOTHING where there is none."""
     texels = surface.texels
-    shown = np.full((_VIEWS, len(index), 3), np.nan, np.float32)
+    kinds = np.full((_VIEWS, len(index)), NOTHING, np.int8)
+    shown = np.zeros((_VIEWS, len(index), 3), np.float32)
     order = [int(i) for i in np.unique(views) if i >= 0]
     for i, pixels in read_frames(partial(read_frame, frames), order):
         column, row = np.nonzero(views == i)
         camera = frames.camera(i)
         surfaces = first_surfaces(surface.rays, surface.scene.face_object, camera)
         picture = Picture.of(pixels)._replace(radiance=np.nan_to_num(pixels.radiance))
-        kind, radiance = samples_from_frame(
+        kinds[row, column], shown[row, column] = samples_from_frame(
             texels.take(index[column]), owner[column], surfaces, picture, camera
         )
-        told = kind == SAMPLE
-        shown[row[told], column[told]] = radiance[told]
-    return shown
+    return kinds, shown
+
+
+def angles_of_glare(surface: TexturedScene, frames: Frames, index: Long, seed: int) -> Double:
+    """(N,) degrees: how far apart directions are from which frames see texels ``index`` (N,) clip,
+    at most, of some of these frames; 0 of fewer than two. A mirror image stays where it is."""
+    owner, texels = surface.texels.object_index()[index], surface.texels
+    views = _some_that_see(surface, frames, index, range(len(frames)), seed)
+    clips = _samples_of(surface, frames, index, owner, views)[0].T == CLIPPED
+    eyes = np.stack([frames.camera(i).eye for i in range(len(frames))])
+    towards = eyes[views] - texels.position[index][:, None]
+    towards /= np.linalg.norm(towards, axis=2, keepdims=True)
+    cosine = np.einsum("nik,njk->nij", towards, towards)
+    both = clips[:, :, None] & clips[:, None]
+    least = np.where(both, cosine, 1.0).min(axis=(1, 2))
+    return np.asarray(np.degrees(np.arccos(np.clip(least, -1, 1))), np.float64)
 
 
 def mirrored_irradiance(surface: TexturedScene, light: Float, index: Long, seed: int) -> Double:
