@@ -94,14 +94,13 @@ def clipped_groups(
     found: list[tuple[float, int, float, bool, bool, Long]] = []
     measured, clipped = coverage.measured, coverage.clipped
     bright = radiance.max(axis=1)
-    reach = _AROUND * float(np.sqrt(texels.area.sum()))
+    reach, shown = _AROUND * float(np.sqrt(texels.area.sum())), _clips_alone(texels, coverage)[1]
     for i in range(len(texels.resolution)):
         own = np.arange(*texels.of_object(i).indices(len(texels)))
         candidates, around = own[clipped[own]], own[measured[own]]
         shines = texels.area[candidates].sum()
         whole, small = shines > texels.area[around].sum(), len(candidates) < _MIN_TEXELS
-        shown = not len(around) and shines > _SHOWN_OF_SMALL * texels.area[own].sum()
-        if small and not (whole and said.get(i, shown or i in hardly_shown)):
+        if small and not (whole and said.get(i, bool(shown[i]) or i in hardly_shown)):
             continue
         parts = [own[~measured[own]]] if whole else _connected(texels, candidates)
         for part in parts:
@@ -134,17 +133,25 @@ def clipped_groups(
 def hardly_shown(texels: Texels, coverage: CoverageMap, said: Mapping[int, bool]) -> Long:
     """Numbers of the objects of which few texels clip and no others are seen, and hardly any of
     it: spots seen from the side, or glints. None of those that are ``said`` to be lamps or not."""
+    number, shown = _clips_alone(texels, coverage)
+    few = (number > 0) & (number < _MIN_TEXELS) & ~shown
+    few[[*said]] = False
+    return np.flatnonzero(few)
+
+
+def _clips_alone(texels: Texels, coverage: CoverageMap) -> tuple[Long, Bool]:
+    """Of each object: how many texels clip, 0 where others are measured; and whether these are
+    enough of it for a lamp, however few."""
     owner, count = texels.object_index(), len(texels.resolution)
-    num_clipped, num_measured = (
+    clipped, measured = (
         np.bincount(owner[kind], minlength=count) for kind in (coverage.clipped, coverage.measured)
     )
     area, shines = (
         np.bincount(owner, weights, count)
         for weights in (texels.area, texels.area * coverage.clipped)
     )
-    few = (num_clipped > 0) & (num_clipped < _MIN_TEXELS) & (num_measured == 0)
-    few[[*said]] = False
-    return np.flatnonzero(few & (shines <= _SHOWN_OF_SMALL * area))
+    number = np.where(measured == 0, clipped, 0)
+    return number, (number > 0) & (shines > _SHOWN_OF_SMALL * area)
 
 
 def _connected(texels: Texels, candidates: Long) -> list[Long]:
