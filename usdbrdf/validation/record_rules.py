@@ -202,7 +202,6 @@ _STATED = {
     "measured": ["phi", "psi", "phiError"],
     "bounded": ["phi", "psi", "psiUpper95"],
     "undetermined": ["phi", "psi"],
-    "prior": ["phi", "psi"],  # as older versions called it
 }
 
 
@@ -216,7 +215,7 @@ def fit_status(scene: AssetStage) -> Iterator[Fault]:
     Run usdbrdf fit again; do not change the status by hand."""
     for prim in scene.recorded:
         status = authored(prim, "usdBrdf:fit:status")
-        wanted = _STATED.get(status, [])
+        wanted = _STATED.get(FACTS["usdBrdf:fit:status"].read(status), [])
         if status == "measured" and authored(prim, "usdBrdf:fit:method") == "views":
             wanted = [*wanted, "psiError"]  # a single frame does not tell it
         missing = [name for name in wanted if authored(prim, f"usdBrdf:fit:{name}") is None]
