@@ -89,7 +89,7 @@ def main() -> int:
     rng = np.random.default_rng([options.seed, EXPOSURES])
     gains = np.exp(options.exposure_drift * rng.standard_normal(len(frames)))
     gains[::10] *= 2**options.tenth_stops
-    copy_unchanged(options.capture, options.output, images | {document.get("mesh", "mesh.ply")})
+    copy_unchanged(options.capture, options.output, images | {mesh_name(document)})
     disturb_mesh(options, document)
     for i, (frame, gain) in enumerate(zip(frames, gains, strict=True)):
         disturb_image(options.capture, options.output, frame, float(gain), options.clip)
@@ -202,9 +202,15 @@ def decoded(stored: Array) -> Array:
 ENCODINGS = {"srgb": encoded, "linear": decoded}
 
 
+def mesh_name(document: dict[str, Any]) -> str:
+    """Of its file, beside the document where that does not say another."""
+    return str(document.get("mesh", "mesh.ply"))
+
+
 def disturb_mesh(options: argparse.Namespace, document: dict[str, Any]) -> None:
     """Write the mesh, larger, turned, moved, or with one object of it elsewhere."""
-    source = options.capture / document.get("mesh", "mesh.ply")
+    name_of_mesh = mesh_name(document)
+    source = options.capture / name_of_mesh
     mesh = mesh_from_file(source)
     points = mesh.points.astype(np.float64)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -219,15 +225,10 @@ def disturb_mesh(options: argparse.Namespace, document: dict[str, Any]) -> None:
         own = np.unique(mesh.triangles[mesh.face_label == number])
         moved[own, 0] += float(millimetres) / 1000
     if (moved == points).all():
-        link_or_copy(source, options.output / document.get("mesh", "mesh.ply"))
+        link_or_copy(source, options.output / name_of_mesh)
         return
     moved_points = moved.astype(np.float32)
-    write_ply(
-        options.output / document.get("mesh", "mesh.ply"),
-        moved_points,
-        mesh.triangles,
-        mesh.face_label,
-    )
+    write_ply(options.output / name_of_mesh, moved_points, mesh.triangles, mesh.face_label)
 
 
 def disturbed_pose(pose: Array, degrees: Array, metres: Array) -> Array:

@@ -72,8 +72,8 @@ def agreement_of_frames(
         images = read_frames(read, asked)
         for i, pixels in progress(images, total=len(asked), label="agreement", unit="frames"):
             camera = frames.camera(i)
-            # Pictures are halved further where the frames' sizes differ.
-            pictures[i] = logarithms(pixels, max(1, pixels.valid.shape[1] // (2 * FINEST)))
+            if i not in pictures:  # which are halved further where the frames' sizes differ
+                pictures[i] = logarithms(pixels, max(1, pixels.valid.shape[1] // (2 * FINEST)))
             for name, step in steps.items():
                 pose = _READINGS[name](camera.world_from_camera)
                 other = replace(camera, world_from_camera=pose)
