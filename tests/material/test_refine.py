@@ -283,6 +283,21 @@ def _beside(texels, before) -> np.ndarray:
     return beside_seen(texels, before.coverage.observed | before.emissive)
 
 
+def test_where_nothing_filters_its_noise_rays_tell_the_lobes_light(room: Room, tmp_path: Path):
+    atlas = room.clean
+    lit, which = atlas.lit_scene(black_environment()), _reflecting(room, room.clean)
+    traced, same = atlas.irradiance, np.zeros_like(atlas.lit)
+    one, other = (
+        refined_irradiance(
+            TaskRun(tmp_path, "fit", tmp_path / f"work{seed}"), lit, traced, same, _lobes(atlas),
+            "none", seed,
+        )[which]
+        for seed in (1, 2)
+    )  # fmt: skip
+    noise = np.sqrt(np.mean((one - other) ** 2) / 2) / np.mean(one - traced[which])
+    assert noise < 0.2, noise
+
+
 def test_what_nobody_saw_reflects_the_light_that_reaches_it(fitted: Asset):
     atlas = _atlas(fitted)
     unseen = ~atlas.coverage.observed

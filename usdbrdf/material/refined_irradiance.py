@@ -7,6 +7,7 @@ What their cure changes is small against S, so few rays do."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
 from usdbrdf.options import Sampling
 from usdbrdf.shading.shaded import by_tiles, denoised_irradiance
 from usdbrdf.transport.brdf import DIELECTRIC
-from usdbrdf.transport.denoise import OIDN
+from usdbrdf.transport.denoise import NONE, OIDN
 from usdbrdf.transport.environment import black_environment
 from usdbrdf.transport.irradiance import ByAngle, irradiance_at
 from usdbrdf.transport.let_through import share_let_through, table_let_through
@@ -28,9 +29,10 @@ from usdbrdf.transport.sunlight import sunlight
 from usdbrdf.transport.surface_texture import SurfaceTexture
 
 # Rays per texel for the change of the diffuse light, half of them to where it changes most; and for
-# the specular light, with so many again from where each of them ends.
+# the specular light, by what filters S afterwards, with so many again from where each of them ends.
 _DIFFUSE_RAYS = 64
-_SPECULAR_RAYS, _RAYS_OF_LOBE = 8, 4
+_SPECULAR_RAYS: Mapping[str, int] = {OIDN: 8, NONE: 64}
+_RAYS_OF_LOBE = 4
 # Not the seed of the irradiance as traced: their errors must not add up.
 _SEED = 0x5EED
 
@@ -50,13 +52,14 @@ class Lobes:
 
 class _Change(NamedTuple):
     """What of the light is other than traced before: ``radiance`` by its texture, ``lights`` where
-    that shows, and the specular light of ``lobes``."""
+    that shows, and the specular light of ``lobes`` by so many rays."""
 
     lit: LitScene
     radiance: SurfaceTexture
     lights: Lights
     lobes: Lobes
     sampling: Sampling
+    specular_rays: int
 
 
 def _changed_irradiance(given: _Change, index: Long, patch: Int) -> dict[str, Array]:
@@ -69,7 +72,7 @@ def _changed_irradiance(given: _Change, index: Long, patch: Int) -> dict[str, Ar
     )  # fmt: skip
     specular = specular_irradiance(
         lit, position, normal, index, lobes.phi, lobes.psi,
-        rays=_SPECULAR_RAYS, rays_of_lobe=_RAYS_OF_LOBE, seed=given.sampling.seed,
+        rays=given.specular_rays, rays_of_lobe=_RAYS_OF_LOBE, seed=given.sampling.seed,
     )  # fmt: skip
     return {"change": diffuse.mean + specular}
 
@@ -90,7 +93,7 @@ def refined_irradiance(
     lights = lit.lights_of(np.abs(change))
     sampling = Sampling(standard_error=0, max_rays=_DIFFUSE_RAYS, seed=seed)
 
-    given = _Change(lit, texture, lights, lobes, sampling)
+    given = _Change(lit, texture, lights, lobes, sampling, _SPECULAR_RAYS[lightmap_filter])
     found = by_tiles(run, texels, "refined", "fit: shade", _changed_irradiance, given)["change"]
     refined = np.maximum(traced + np.asarray(found, np.float32), 0)
     return denoised_irradiance(texels, refined) if lightmap_filter == OIDN else refined
