@@ -320,6 +320,10 @@ class AssetMaps:
         """Whether any object has the map."""
         return any(aov_path(self.stage, obj.prim_path, aov) for obj in self.scene.objects)
 
+    def first_of(self, *aovs: str) -> str:
+        """The name of the first of these maps that any object has, else of the last."""
+        return next((aov for aov in aovs if self.has(aov)), aovs[-1])
+
     def map(self, aov: str) -> Float:
         """(T, C): a map that every object has; InputRefused where one has not."""
         if aov not in self._read:

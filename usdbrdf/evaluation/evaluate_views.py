@@ -77,7 +77,7 @@ def evaluate(
         seen = viewed_asset(place, atlas, chosen.environment)
         known = {}
         if chosen.truth is not None:
-            albedo = _map_or(atlas, "base_color", "albedo")
+            albedo = atlas.first_of("base_color", "albedo")
             known = {"truth": metrics.compare_with_truth(atlas, chosen.truth, chosen.mesh, albedo)}
         photographs = photographs_of_views(
             Path(views), place, atlas.stage, atlas.scene, folder, chosen.allow_outside
@@ -94,7 +94,7 @@ def evaluate(
             "rays": chosen.rays,
             "seed": chosen.seed,
             "exposure": exposure,
-            "diffuse_map": _map_or(atlas, "diffuse", "lit"),
+            "diffuse_map": atlas.first_of("diffuse", "lit"),
             "summary": report.summary_of_views(rows),
             "frames": rows,
             **known,
@@ -109,11 +109,6 @@ def measured_atlas(folder: Path, lighting: str | None = None) -> tuple[Asset, As
     asset = Asset.made(folder).in_lighting(lighting)
     refuse_missing(asset, 1 + len(ROLES))
     return asset, AssetMaps(open_measured(asset))
-
-
-def _map_or(atlas: AssetMaps, aov: str, otherwise: str) -> str:
-    """The name of the first map where the asset has it, else of the second."""
-    return aov if atlas.has(aov) else otherwise
 
 
 def exposure_of_views(frames: Frames) -> float:
@@ -283,7 +278,7 @@ def viewed_asset(asset: Asset, atlas: AssetMaps, environment: Surroundings) -> V
     if isinstance(environment, Path) and (unknown := unknown_primaries(environment)):
         warn(unknown)
     lit = replace(surfaces, lobe=kind, beckmann=beckmann)
-    diffuse = atlas.map_where_present(_map_or(atlas, "diffuse", "lit"), 3)
+    diffuse = atlas.map_where_present(atlas.first_of("diffuse", "lit"), 3)
     return ViewedAsset(
         lit=lit,
         measured=lit.radiance.showing(atlas.texels, atlas.map("lit")),

@@ -119,7 +119,7 @@ def _side(
     atlas.environment(how.environment)  # which may be refused
     truth = None
     if how.truth is not None:
-        albedo = "base_color" if atlas.has("base_color") else "albedo"
+        albedo = atlas.first_of("base_color", "albedo")
         truth = metrics.compare_with_truth(atlas, how.truth, how.mesh, albedo)
     folder.mkdir()
     views = _views(own, atlas, document, options, folder)
