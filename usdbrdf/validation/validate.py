@@ -15,11 +15,12 @@ from pathlib import Path
 from pxr import Sdf, Tf, Usd, UsdShade, UsdValidation
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header
-from usdbrdf.asset.layout import Asset, version_around
+from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, no_warnings, try_in_child
-from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, UsageError
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.job.ownership import reading
+from usdbrdf.job.versions import refuse_version
 from usdbrdf.validation import file_rules, material_rules, record_rules, review_rules, variant_rules
 from usdbrdf.validation.rule import (
     PREFIX,
@@ -229,13 +230,7 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
     )
     if path.suffix != ".usda":
         raise UsageError(f"{path}: the cures are written as text; name a .usda file. [fix.suffix]")
-    if version_around(path) or (
-        asset.is_published and path.is_relative_to(asset.folder.absolute())
-    ):
-        raise OwnershipConflict(
-            f"{path}: a published version never changes. Cure the asset that it was published "
-            "from. [fix.published]"
-        )
+    refuse_version(path)
     if os.path.lexists(path):
         raise UsageError(taken)
     reserved = [asset.folder / name for name in ("layers", "textures", ".usdbrdf")]
