@@ -18,7 +18,7 @@ from usdbrdf.asset.header import Provenance, new_layer, read_header
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, no_warnings, try_in_child
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
-from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
+from usdbrdf.files.atomic import cure_of_writing, environment_failures, publish, temporary_beside
 from usdbrdf.job.ownership import reading
 from usdbrdf.job.versions import refuse_version
 from usdbrdf.validation import file_rules, material_rules, record_rules, review_rules, variant_rules
@@ -206,14 +206,14 @@ class Cured:
 
 
 @contextmanager
-def _on_disk(path: Path) -> Iterator[None]:
-    """What USD says while it writes a file is about the disk."""
+def _on_disk(path: Path, written: Path) -> Iterator[None]:
+    """What USD says while it writes a file, to be ``path``, is about the disk."""
     try:
         yield
     except Tf.ErrorException as error:
         raise EnvironmentFailure(
-            f"{path}: USD could not write it ({in_one_line(error)}). Free disk space or correct "
-            "the permission, then run the same command again. [environment.io]"
+            f"{path}: USD could not write it ({in_one_line(error)}). {cure_of_writing(written)}, "
+            "then run the same command again. [environment.io]"
         ) from error
 
 
@@ -248,7 +248,7 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
             "Cures by usdbrdf validate --fix. They take effect as the first sublayer of "
             f"{asset.root_layer.name}."
         )
-        with _on_disk(path):
+        with _on_disk(path, written):
             header.Export(str(written))
         cures = Sdf.Layer.FindOrOpen(str(written))
         # Stronger than all other layers, in memory alone.
@@ -263,7 +263,7 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
         after = {complaint(found) for _, _, found in _curable(AssetStage(stage))}
         cured = tuple(found for found in applied if complaint(found) not in after)
         if cured:
-            with _on_disk(path):
+            with _on_disk(path, written):
                 cures.Save()
             _publish_new(written, path, taken)
     return Cured(layer=path, findings=cured)
