@@ -103,6 +103,7 @@ def words_for(command, option, places, place):
     return [command, *placed, *named]
 
 
+@pytest.mark.fault("R18")
 @pytest.mark.parametrize(("command", "option"), WRITTEN)
 def test_no_command_writes_into_a_version(places, capsys, command, option):
     more = []
@@ -126,6 +127,7 @@ def test_every_command_that_writes_is_among_them():
     }
 
 
+@pytest.mark.fault("R18")
 @pytest.mark.parametrize("lost", ["", "manifest.json", "v001.usd"])
 @pytest.mark.parametrize("name", ["v001", "renamed"])
 def test_a_version_that_was_renamed_or_lost_a_file_is_one_still(places, name, lost):
