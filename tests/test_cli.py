@@ -762,9 +762,12 @@ def test_a_full_disk_behind_stdout(arguments):
 
 
 CURES = {
-    errno.EACCES: "Free disk",
-    errno.EIO: "Free disk",
-    errno.ESTALE: "Free disk",
+    errno.EACCES: "Correct the permission, then",
+    errno.EROFS: "Make the file system writable",
+    errno.ENOSPC: "Free disk space, then",
+    errno.EDQUOT: "Free disk space of your quota",
+    errno.EIO: "Check the disk",
+    errno.ESTALE: "Check the disk",
     errno.EMFILE: "Raise this shell's limit on open files",
     errno.EAGAIN: "Raise the limits on processes",  # of a fork
 }

@@ -27,7 +27,7 @@ from typing import Any, ParamSpec
 from usdbrdf.asset.adopt import adopt, is_damaged
 from usdbrdf.asset.layers.interface import cut_root_aside, is_cut, mend_root
 from usdbrdf.asset.layers.scan_layer import is_edited
-from usdbrdf.asset.layout import Asset, version_around
+from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import warn_of_edits
 from usdbrdf.cluster.options import ClusterOptions
 from usdbrdf.cluster.session import workers_of as workers_of
@@ -39,6 +39,7 @@ from usdbrdf.job.progress import say, warn
 from usdbrdf.job.stamp import STATE_FOLDER, known_hashes
 from usdbrdf.job.task import TaskResult
 from usdbrdf.job.units import HERE, Workers
+from usdbrdf.job.versions import refuse_version
 from usdbrdf.options import ConvertOptions, HandEdits, ShadeOptions, TextureOptions
 from usdbrdf.tasks.fit import fit as fit_task
 from usdbrdf.tasks.fit import refuse_one_frame
@@ -114,12 +115,7 @@ def working_on(
     if is_held(place / STATE_FOLDER):
         yield Asset.at(place)
         return
-    version = version_around(place)
-    if version or (place.is_dir() and Asset.at(place).is_published):
-        raise OwnershipConflict(
-            f"{version or place}: a published version never changes. Work in the asset that it was "
-            "published from, or in a new folder. [ownership.published]"
-        )
+    refuse_version(place)
     with owned_folder(place, wait_s=wait_s, without_lock=without_lock) as state:
         asset, before = Asset.at(place), known_hashes(state)
         changed = edited_files(asset.folder)

@@ -174,7 +174,7 @@ def test_a_folder_that_cannot_be_locked_is_said(advised, tmp_path, capsys):
 
 def test_a_published_version_is_left_alone(advised, tmp_path):
     usdbrdf_publish = usdbrdf.publish(advised[0], tmp_path / "versions")
-    with pytest.raises(OwnershipConflict, match=r"\[advice\.published\]"):
+    with pytest.raises(OwnershipConflict, match=r"\[ownership\.published\]"):
         usdbrdf.advise(usdbrdf_publish["publish"])
     assert not list((tmp_path / "versions").rglob("advice*"))
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 
 from tests.scenes import make_capture
 from usdbrdf.capture.adapters import choose_adapter, read_scan
+from usdbrdf.delivery.publish import publish
 from usdbrdf.errors import InputRefused
-from usdbrdf.options import IngestOptions
+from usdbrdf.job.stamp import STATE_FOLDER
+from usdbrdf.options import IngestOptions, InspectOptions
+from usdbrdf.tasks.inspect import inspect
 
 DOCUMENTS = [
     ("castle.nvm", "NVM_V4\n\n11\n", "VisualSFM", "COLMAP"),
@@ -209,6 +213,25 @@ def test_the_folder_above_a_capture_names_the_one_to_ask_for(tmp_path):
     (tmp_path / "export/scene/transforms.json").write_text("{}")
     said = _refused(tmp_path)
     assert said.startswith(": no capture itself, but export/scene/ in it is one (transforms). Name")
+
+
+def test_a_folder_of_assets_or_versions_is_no_capture_and_none_in_it_is(built, tmp_path):
+    """Their layers of cameras, meshes and photographs are what a capture of USD holds."""
+    publish(built.asset.folder, tmp_path / "versions")
+    shutil.copytree(tmp_path / "versions/v001", tmp_path / "versions/v002")
+    (built.asset.folder / STATE_FOLDER).mkdir(exist_ok=True)
+    for folder, what in (
+        (tmp_path / "versions", "v001/ is a published version of an asset, v002/ is a published"),
+        (built.asset.folder.parent, "room/ is an asset"),
+    ):
+        said = inspect(folder, InspectOptions(), plugins=False).refusals[0]
+        assert f": no capture; in it {what}" in str(said)
+        assert str(said).endswith("report and view look at assets. [capture.asset]")
+    # Beside an asset there may be what is to become one, and that is what to speak of.
+    (built.asset.folder.parent / "0.jpg").write_bytes(b"")
+    assert "pictures, but nothing known here" in _refused(built.asset.folder.parent)
+    make_capture(tmp_path / "versions/west", subdivisions=1)
+    assert "west/ in it is one (transforms). Name" in _refused(tmp_path / "versions")
 
 
 @pytest.mark.parametrize("name", ["Transforms.json", "transforms (1).json", "transforms.json.txt"])

@@ -7,6 +7,7 @@ import errno
 import fcntl
 import hashlib
 import os
+import re
 import resource
 import shutil
 import socket
@@ -23,6 +24,7 @@ from tests.fault_injection import VARIABLE, Fault
 from usdbrdf.errors import EnvironmentFailure
 from usdbrdf.files import atomic
 from usdbrdf.files.atomic import (
+    cure_of_writing,
     environment_failures,
     failure_of_machine,
     flush_file,
@@ -321,6 +323,40 @@ except EnvironmentFailure as error:
     assert said.startswith(f"stamp: File too large ('{path}'). ")
     assert said.endswith("[environment.io]\n")
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.txt", "old")]
+
+
+@pytest.mark.parametrize(
+    ("error", "cure"),
+    [
+        (PermissionError(errno.EACCES, "no"), "Correct the permission"),
+        (PermissionError(errno.EPERM, "no"), "Correct the permission"),
+        (OSError(errno.EROFS, "no"), "Make the file system writable, or name another place"),
+        (OSError(errno.ENOSPC, "no"), "Free disk space"),
+        (OSError(errno.EIO, "no"), "Check the disk, or the network that it is on"),
+        (NotADirectoryError(errno.ENOTDIR, "no"), "Check the path, and see that nothing else .*"),
+        # numpy's of a full disk, and numbers that mean neither
+        (OSError("10 requested and 3 written"), "Free disk space or correct the permission"),
+        (OSError(errno.ENOTSUP, "no"), "Free disk space or correct the permission"),
+    ],
+)
+def test_what_helps_is_what_the_systems_number_says(tmp_path, monkeypatch, error, cure):
+    with (
+        pytest.raises(EnvironmentFailure, match=rf"^it: .*\. {cure}, then run the same"),
+        environment_failures("it"),
+    ):
+        raise error
+
+    def refused(*_):
+        raise error
+
+    monkeypatch.setattr(Path, "open", refused)
+    assert re.fullmatch(cure, cure_of_writing(tmp_path / "a"))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_library_that_tells_no_number_is_asked_for_by_writing_more(tmp_path):
+    assert cure_of_writing(Path("/dev/full")) == "Free disk space"
+    assert cure_of_writing(tmp_path / "a").startswith("Free disk space or ")
 
 
 @pytest.mark.fault("R1")

@@ -325,6 +325,31 @@ def test_metals_guesses_and_many_warnings_look_like_what_they_are(opened, page_f
     assert shown.faults == []
 
 
+def test_what_is_bounded_is_found_by_its_status_and_tells_its_bound(opened, page_file, tmp_path):
+    """The bound is told of the numbers that are hardly known, too, as the columns' words say."""
+    data = data_of(page_file.read_text("utf-8"))
+    bounded = next(row for row in data["objects"] if row["status"] != "lamp" and row.get("costs"))
+    bounded |= {"status": "bounded", "because": "bounded", "f0": None, "material": "diffuse"}
+    bounded |= {"psi": 0.16, "psi_error": 0.11, "psi_confidence": "low", "psi_upper": 0.37}
+    bounded |= {"evidence": -0.001, "target": bounded["frame"]}
+    (tmp_path / "bounded.html").write_text(page(data), "utf-8")
+    shown = opened((tmp_path / "bounded.html").as_uri())
+    shown.get_by_label("Status").select_option("bounded")
+    row = shown.locator("#table tbody tr:not(.detail):visible")
+    assert row.count() == 1
+    assert row.locator("td.number").nth(1).inner_text() == "0.16, below 0.37"
+    assert row.locator("td.number").nth(2).inner_text() == "0 %"
+    shown.get_by_role("button", name=bounded["label"], exact=True).click()
+    detail = shown.locator("#table tbody tr.detail:visible").inner_text()
+    assert "where a highlight would show best" in detail
+    shown.get_by_label("Status").select_option("")
+    shown.get_by_role("columnheader", name="Status").get_by_role("button").click()
+    last = shown.locator("#table tbody tr:not(.detail) td:nth-child(3)").all_inner_texts()
+    assert "bounded" in last
+    assert set(last[last.index("bounded") + 1 :]) <= {"measured"}
+    assert shown.faults == []
+
+
 def test_what_was_not_fitted_says_why_and_shows_no_numbers(opened, page_file, tmp_path):
     data = data_of(page_file.read_text("utf-8"))
     pane, seen_through, *_ = (row for row in data["objects"] if row["status"] != "lamp")

@@ -11,7 +11,7 @@ from tests.page.conftest import data_of, fit_of
 from usdbrdf.evaluation.evaluate_views import measured_atlas
 from usdbrdf.page.capture import findings
 from usdbrdf.page.daylight import is_dark
-from usdbrdf.page.objects import _numbers
+from usdbrdf.page.objects import _numbers, why
 from usdbrdf.page.pictures import status_of
 from usdbrdf.transport.environment import NO_SUN, Environment, Sun
 
@@ -97,3 +97,17 @@ def test_the_table_says_of_an_object_why_it_is_not_known(room, numbers, in_sight
 def test_the_page_carries_these_words(page_file):
     rows = data_of(page_file.read_text("utf-8"))["objects"]
     assert {row["because"] for row in rows} >= {"lamp"}
+
+
+def test_what_is_bounded_is_told_as_weak_highlights():
+    """Whoever judges knows no bound of psi by heart: below what is usual is what it says."""
+    assert findings({"texture": {}, "shade": {}}, ["bounded"], True)[1].startswith(
+        "1 is bounded: photographs do not determine both numbers, but tell that highlights are "
+        "weaker than usual, if there are any."
+    )
+    fit = fit_of(status="bounded", evidence=0.0, psi_upper=0.117)
+    assert why(fit, "bounded", None).endswith(
+        "Its highlights, if it has any, are weaker than usual: psi is below 0.12 with 95 %."
+    )
+    known = fit_of(status="undetermined", evidence=0.0, psi_upper=0.9)
+    assert why(known, "undetermined", None).endswith("determined. psi is below 0.90 with 95 %.")

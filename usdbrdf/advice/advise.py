@@ -42,7 +42,7 @@ from usdbrdf.advice.words import (
     told_objects,
     where,
 )
-from usdbrdf.asset.advice import AdvisedPose, refuse_published, write_advice
+from usdbrdf.asset.advice import AdvisedPose, write_advice
 from usdbrdf.asset.header import read_header
 from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.maps import AssetMaps
@@ -54,6 +54,7 @@ from usdbrdf.evaluation.evaluate_views import measured_atlas, viewed_asset
 from usdbrdf.files.atomic import environment_failures
 from usdbrdf.job.ownership import folder_lock
 from usdbrdf.job.stamp import STATE_FOLDER
+from usdbrdf.job.versions import refuse_version
 from usdbrdf.material.fit_views import MIN_OBSERVATIONS
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.mesh import LEFT_OUT
@@ -102,7 +103,7 @@ def advise(
     """
     chosen = options or AdviseOptions()
     asset = Asset.made(Path(folder))
-    refuse_published(asset)
+    refuse_version(asset.folder)
     state = asset.folder / STATE_FOLDER
     with environment_failures(str(state)), folder_lock(state, wait_s, without_lock=without_lock):
         place, atlas = measured_atlas(asset.folder, chosen.lighting)

@@ -14,7 +14,7 @@ from usdbrdf.asset.layout import LIGHTING, ROLES, Asset, relative_path
 from usdbrdf.asset.readers.compose import in_one_line, try_in_child
 from usdbrdf.asset.readers.tried import try_layers
 from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict
-from usdbrdf.files.atomic import make_folders, publish, temporary_beside
+from usdbrdf.files.atomic import cure_of_writing, make_folders, publish, temporary_beside
 
 _LAYER_SUFFIXES = frozenset({".usd", ".usda", ".usdc"})
 
@@ -119,7 +119,7 @@ def _adopt_layer(path: Path, target: Path, asset: Asset, copies: Mapping[Path, P
             text.Export(str(written))
         except Tf.ErrorException as error:
             raise EnvironmentFailure(
-                f"{target}: USD could not write it ({in_one_line(error)}). Free disk space or "
-                "correct the permission, then run the same command again. [environment.io]"
+                f"{target}: USD could not write it ({in_one_line(error)}). "
+                f"{cure_of_writing(written)}, then run the same command again. [environment.io]"
             ) from error
         publish(written, target)

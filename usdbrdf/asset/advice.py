@@ -22,8 +22,9 @@ from usdbrdf.asset.layers.scan_layer import FAR_M, NEAR_M, lens_from_pinhole
 from usdbrdf.asset.layout import ROLES, Asset
 from usdbrdf.asset.readers.scene import LENS
 from usdbrdf.asset.readers.tried import try_layers
-from usdbrdf.errors import InputRefused, OwnershipConflict
+from usdbrdf.errors import InputRefused
 from usdbrdf.files.atomic import environment_failures, publish, sha256_of, temporary_beside
+from usdbrdf.job.versions import refuse_version
 from usdbrdf.model.camera import Camera
 
 Types = Sdf.ValueTypeNames
@@ -103,19 +104,10 @@ def inputs_of_advice(asset: Asset) -> dict[str, str]:
     return {layer.name: sha256_of(layer) for layer in layers if layer.is_file()}
 
 
-def refuse_published(asset: Asset) -> None:
-    """OwnershipConflict for a published version."""
-    if asset.is_published:
-        raise OwnershipConflict(
-            f"{asset.folder}: a published version never changes. Ask for advice on the asset that "
-            "it was published from. [advice.published]"
-        )
-
-
 def write_advice(asset: Asset, poses: Sequence[AdvisedPose], parameters: Mapping[str, Any]) -> Path:
     """Write the layer, whole or not at all. Where nothing is advised it has no cameras, and stays
     for those who made it a sublayer. Equal advice gives equal bytes."""
-    refuse_published(asset)
+    refuse_version(asset.folder)
     file, header = asset.advice_layer, read_header(asset.layer("scan"))
     draft = Draft(
         asset=asset,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import posixpath
-import re
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -13,10 +12,10 @@ from typing import Any
 
 from pxr import Sdf, Tf
 
-from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
-from usdbrdf.files.documents import read_json
+from usdbrdf.errors import InputRefused, UsageError
 from usdbrdf.files.naming import identifier_from
 from usdbrdf.job.stamp import read_stamp, stamp_path
+from usdbrdf.job.versions import refuse_version
 
 # The layers that the tasks write, weakest first; each sees only those before it.
 ROLES = ("scan", "texturing", "shading", "material")
@@ -27,35 +26,6 @@ _OWN_FOLDERS, _DEEPEST = ("layers", "objects", "textures", "previews"), 4
 _TABLES = ("parameters", "inputs", "competing_bindings")
 # The variant set that chooses among several lightings of a scene.
 LIGHTING = "lighting"
-
-# In each folder of a published version, and how these are called.
-MANIFEST, VERSION = "manifest.json", re.compile(r"v(\d{3,9})")
-
-
-def version_around(place: Path) -> Path | None:
-    """The published version that a place is or lies in, whatever asset it is of; links are
-    followed."""
-    inner = place.resolve()
-    return next(
-        (
-            folder
-            for folder in (inner, *inner.parents)
-            if VERSION.fullmatch(folder.name) and _is_our_manifest(folder / MANIFEST)
-        ),
-        None,
-    )
-
-
-def _is_our_manifest(file: Path) -> bool:
-    """Whether it has the entries of one, for those of other programs are called so too; or had
-    them, if it is damaged."""
-    if not os.path.isfile(file):
-        return False
-    try:
-        record = read_json(file)
-    except InputRefused:
-        return True
-    return isinstance(record, dict) and {"schema", "check", "files"} <= record.keys()
 
 
 @dataclass(frozen=True)
@@ -236,15 +206,11 @@ class Asset:
     def refuse_output(self, output: Path, rule: str) -> None:
         """UsageError for a place inside the folder: what reads an asset leaves it as it is.
         OwnershipConflict for one in a published version of any."""
+        refuse_version(output)
         if output.resolve().is_relative_to(self.folder.resolve()):
             raise UsageError(
                 f"{output}: lies inside the asset {self.folder}, which stays as it is. Name "
                 f"another place. [{rule}]"
-            )
-        if (version := version_around(output)) is not None:
-            raise OwnershipConflict(
-                f"{output}: {version} is a published version, which never changes. Name another "
-                f"place. [{rule}]"
             )
 
     def texture(self, identifier: str, aov: str) -> str:

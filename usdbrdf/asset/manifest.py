@@ -8,13 +8,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from usdbrdf.asset.layout import MANIFEST, Asset
+from usdbrdf.asset.layout import Asset
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import sha256_of
 from usdbrdf.files.colour import WORKING_SPACE
 from usdbrdf.files.documents import json_text, read_json, write_json
 from usdbrdf.files.paths import files_below
 from usdbrdf.job.stamp import check_relative
+from usdbrdf.job.versions import MANIFEST
 
 _SCHEMA = 1
 

@@ -27,9 +27,10 @@ from usdbrdf.asset.maps import AssetMaps
 from usdbrdf.asset.properties import FittedObject
 from usdbrdf.asset.readers.compose import open_measured
 from usdbrdf.asset.readers.scene import read_fit, read_shading
-from usdbrdf.errors import InputRefused, OwnershipConflict, UsdBrdfError
+from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
 from usdbrdf.files.documents import read_text
+from usdbrdf.job.versions import refuse_version
 from usdbrdf.model.mesh import DIRECTIVES, IN_PART, OF_SHADE
 
 VERDICTS = ("accept", "reject")
@@ -206,11 +207,7 @@ def judgements_of(asset: Asset, said: Any) -> dict[str, Judgement]:
 
 def write_review(asset: Asset, judgements: Mapping[str, Judgement]) -> None:
     """Write the layer, whole or not at all; equal judgements give equal bytes."""
-    if asset.is_published:
-        raise OwnershipConflict(
-            f"{asset.folder}: a published version never changes. Review the asset that it was "
-            "published from. [review.published]"
-        )
+    refuse_version(asset.folder)
     layer = new_layer(read_header(asset.layer("scan")), Provenance(role="review", version=_VERSION))
     Sdf.CreatePrimInLayer(layer, f"/{asset.name}")
     layer.documentation = "What people said of the objects; written by usdbrdf view and its page."

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError
+from usdbrdf.errors import InputRefused, UsageError, UsdBrdfError, first_of
 from usdbrdf.files.atomic import environment_failures, raise_shortage
 from usdbrdf.files.paths import refuse_nameless, seen_of
 from usdbrdf.job.progress import warn
@@ -189,6 +189,8 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
 
     with environment_failures(str(path)):
         below = next(_recognised_below(path, sound), None)
+        if below is None:
+            _refuse_results(path)
         above = None if below else next(_recognised_above(path, sound), None)
         said = (
             f"no capture itself, but {below[0].as_posix()}/ in it is one ({below[1].name}). Name "
@@ -203,14 +205,39 @@ def choose_adapter(path: Path, name: str | None = None, *, plugins: bool = True)
 
 
 def _recognised_below(path: Path, sound: list[Adapter]) -> Iterator[tuple[Path, Adapter]]:
-    """Folders in a folder that one of our adapters recognises, and in these."""
+    """Folders in a folder that one of our adapters recognises, and in these; none that are assets,
+    whose layers look like a capture of USD."""
     if not path.is_dir():
         return
     for pattern in ("*/", "*/*/"):
         for folder in seen_of(path.glob(pattern), below=path)[:_MOST_BELOW]:
+            if any(_result_in(place) for place in (folder, folder.parent)):
+                continue
             for adapter in sound:
                 if adapter.module and adapter.name in MODULES and adapter.module.matches(folder):
                     yield folder.relative_to(path), adapter
+
+
+def _result_in(folder: Path) -> str:
+    """What a folder is that the steps or publish wrote; "" of any other."""
+    from usdbrdf.job.stamp import STATE_FOLDER
+    from usdbrdf.job.versions import version_around
+
+    if version_around(folder) is not None:
+        return "a published version of an asset"
+    return "an asset" if (folder / STATE_FOLDER).is_dir() else ""
+
+
+def _refuse_results(path: Path) -> None:
+    """InputRefused for a folder that holds assets or published versions and nothing else."""
+    inside = seen_of(path.iterdir(), below=path) if path.is_dir() else []
+    found = {place.name: what for place in inside if (what := _result_in(place))}
+    if found and len(found) == len(inside):
+        names = first_of([f"{name}/ is {what}" for name, what in found.items()])
+        raise InputRefused(
+            f"{path}: no capture; in it {names}, which usdbrdf wrote. Name the capture that it was "
+            "made of; validate, report and view look at assets. [capture.asset]"
+        )
 
 
 def _recognised_above(path: Path, sound: list[Adapter]) -> Iterator[Path]:

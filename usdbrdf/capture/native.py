@@ -23,6 +23,7 @@ from usdbrdf.files.documents import write_json
 from usdbrdf.files.images import read_radiance, write_preview_png
 from usdbrdf.files.ply import write_ply
 from usdbrdf.job.progress import progress, warn
+from usdbrdf.job.versions import refuse_version
 from usdbrdf.model.arrays import Int
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.upright import as_captured
@@ -30,7 +31,8 @@ from usdbrdf.model.upright import as_captured
 
 def refuse_taken(folder: Path, capture: Path) -> None:
     """OwnershipConflict where the folder of a capture to be written holds anything, or lies in the
-    capture that it is made of."""
+    capture that it is made of, or in a published version."""
+    refuse_version(folder)
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise OwnershipConflict(
             f"{folder}: there is something already, and a capture is never written over. Name a "

@@ -21,6 +21,7 @@ from usdbrdf.errors import EnvironmentFailure, UsageError
 from usdbrdf.files.scratch import scratch_folder
 from usdbrdf.job.progress import say
 from usdbrdf.job.units import HERE, Unit, Workers
+from usdbrdf.job.versions import refuse_version
 from usdbrdf.model.arrays import Array
 
 if TYPE_CHECKING:
@@ -81,6 +82,7 @@ def _check_place(place: Path | str | None) -> None:
 
         refuse_unknown(place)
     elif place is not None:
+        refuse_version(Path(place))
         try:
             Path(place).mkdir(parents=True, exist_ok=True)
             if not os.access(place, os.W_OK | os.X_OK):

@@ -22,6 +22,7 @@ from usdbrdf.asset.readers.compose import in_one_line, named_files, open_stage
 from usdbrdf.asset.readers.tried import try_layers
 from usdbrdf.delivery.packaged_files import ADDRESS
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
+from usdbrdf.files.atomic import cure_of_writing
 
 PHOTOGRAPHS, CAPTURED = "photographs", "captured"  # folders for what lies elsewhere
 _LAYERS = frozenset({".usd", ".usda", ".usdc"})
@@ -336,8 +337,8 @@ def _export(layer: Sdf.Layer, path: Path, encoding: str) -> None:
         stored, why = None, f" ({in_one_line(error)})"
     if not stored or stored.defaultPrim != layer.defaultPrim:
         raise EnvironmentFailure(
-            f"{path}: the layer could not be written completely{why}. Free disk space or correct "
-            "the permission. [publish.write]"
+            f"{path}: the layer could not be written completely{why}. {cure_of_writing(path)}, "
+            "then run the same command again. [publish.write]"
         )
 
 

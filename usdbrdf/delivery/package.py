@@ -56,6 +56,7 @@ from usdbrdf.errors import (
     UsdBrdfError,
 )
 from usdbrdf.files.atomic import (
+    cure_of_writing,
     environment_failures,
     folders_above,
     publish,
@@ -456,8 +457,8 @@ def write_usdz(path: Path, folder: Path, members: Sequence[str]) -> None:
             stage, why = None, f" ({in_one_line(error)})"
         if stage is None:
             raise EnvironmentFailure(
-                f"{path}: the package could not be written completely{why}. Free disk space or "
-                "correct the permission. [package.write]"
+                f"{path}: the package could not be written completely{why}. "
+                f"{cure_of_writing(staged)}, then run the same command again. [package.write]"
             )
         problems = [in_one_line(problem) for problem in stage.GetCompositionErrors()]
         for attribute in (a for prim in stage.TraverseAll() for a in prim.GetAuthoredAttributes()):

@@ -15,7 +15,7 @@ from pxr import Sdf
 
 from usdbrdf.asset.layers.author import export
 from usdbrdf.asset.layers.interface import UNPUBLISHED
-from usdbrdf.asset.layout import VERSION, Asset
+from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.manifest import Manifest, changes, read_manifest, write_manifest
 from usdbrdf.asset.readers.compose import not_run, open_edited, outdated_steps, steps_to_come
 from usdbrdf.delivery.copy_of_asset import SPACES, write_copy
@@ -29,6 +29,7 @@ from usdbrdf.files.atomic import (
     temporary_folder,
 )
 from usdbrdf.job.ownership import edited_files, folder_lock, reading
+from usdbrdf.job.versions import VERSION, versions_in
 from usdbrdf.options import PublishOptions
 
 _LOCKED = ".usdbrdf-publish"  # holds the lock of a folder of versions
@@ -164,12 +165,6 @@ def _published(asset: Asset, destination: Path, options: PublishOptions) -> dict
             file.chmod(file.stat().st_mode & 0o444)
         publish_folder(staged, final)
     return _summary(asset, final, manifest, new=True)
-
-
-def versions_in(destination: Path) -> list[str]:
-    """Names of the versions in a folder, the latest last."""
-    names = [entry.name for entry in destination.iterdir() if VERSION.fullmatch(entry.name)]
-    return sorted(names, key=lambda name: int(name[1:]))
 
 
 def _version(asked: str | None, latest: str, earlier: list[str]) -> str:

@@ -13,6 +13,7 @@ from usdbrdf.capture.adapters import choose_adapter
 from usdbrdf.errors import InputRefused, OwnershipConflict, UsageError
 from usdbrdf.files.documents import read_json, read_text
 from usdbrdf.files.naming import unique_identifiers
+from usdbrdf.job.versions import refuse_version
 from usdbrdf.option import is_one_line
 
 SCANS_FILE = "scans.json"
@@ -173,7 +174,9 @@ def read_list(file: Path) -> ScanList:
 
 def refuse_nested(folder: Path, scans: ScanList) -> None:
     """UsageError for a bundle inside a scan, which every result would change, or a scan inside the
-    bundle, where results are written; links are followed."""
+    bundle, where results are written, OwnershipConflict for one inside a published version; links
+    are followed."""
+    refuse_version(folder)
     bundle = folder.resolve()
     for place in _placed(scans).values():
         scan = place.resolve()
@@ -185,7 +188,9 @@ def refuse_nested(folder: Path, scans: ScanList) -> None:
 
 
 def refuse_results_inside(folder: Path, places: Iterable[Path]) -> None:
-    """UsageError for results inside a scan, which each of them would change; links are followed."""
+    """UsageError for results inside a scan, which each of them would change, OwnershipConflict for
+    ones inside a published version; links are followed."""
+    refuse_version(folder)
     results = folder.resolve()
     for place in places:
         scan = place.resolve()

@@ -42,13 +42,27 @@ _NO_THREAD = "can't start new thread"
 _MORE_PROCESSES = (
     "Raise the limits on processes (ulimit -u, or the container's) and on address space (ulimit -v)"
 )
-# What helps against some of them, where it is neither space nor permission.
+# What helps; where there is no number, or another one, nobody knows more than the last of these.
+_PERMISSION, _DISK = "Correct the permission", "Check the disk, or the network that it is on"
 _CURES = {
+    errno.EACCES: _PERMISSION,
+    errno.EPERM: _PERMISSION,
+    errno.EROFS: "Make the file system writable, or name another place",
+    errno.ENOSPC: "Free disk space",
+    errno.EDQUOT: "Free disk space of your quota",
+    errno.EIO: _DISK,
+    errno.ESTALE: _DISK,
+    errno.ETIMEDOUT: _DISK,
     errno.EAGAIN: _MORE_PROCESSES,
     errno.EFBIG: "Raise this shell's limit on the size of files (ulimit -f), or name another disk",
     errno.EMFILE: "Raise this shell's limit on open files (ulimit -n)",
     errno.ENFILE: "Close other programs, which hold all files that this machine can open",
 }
+_OF_PATHS = {
+    errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.ELOOP,
+    errno.ENAMETOOLONG,
+}  # fmt: skip
+_UNKNOWN = "Free disk space or correct the permission"
 # Of a copy, these are about what it was to become.
 _OF_THE_COPY = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 # Of a rename, these are about what was to be replaced, and what it was to be replaced by is ours.
@@ -297,11 +311,29 @@ def _failure(subject: str, error: MemoryError | OSError) -> EnvironmentFailure:
         )
     place = _place_of(error)
     where = f" ({place!r})" if place and str(place) != subject else ""
-    cure = _CURES.get(error.errno or 0, "Free disk space or correct the permission")
     return EnvironmentFailure(
-        f"{subject}: {error.strerror or error}{where}. {cure}, then run the same command again; "
-        "finished work is kept. [environment.io]"
+        f"{subject}: {error.strerror or error}{where}. {_cure_of(error)}, then run the same "
+        "command again; finished work is kept. [environment.io]"
     )
+
+
+def _cure_of(error: OSError) -> str:
+    if error.errno in _OF_PATHS:
+        return "Check the path, and see that nothing else changes it meanwhile"
+    return _CURES.get(error.errno or 0, _UNKNOWN)
+
+
+def cure_of_writing(staged: Path) -> str:
+    """What helps where a library could not write a temporary file and tells no number: what the
+    system says of more bytes at its end, for what they are worth, for the file is given up."""
+    try:
+        with staged.open("ab") as file:
+            file.write(bytes(_BLOCK))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        return _cure_of(error)
+    return _UNKNOWN
 
 
 def failure_of_machine(error: Exception) -> EnvironmentFailure | None:

@@ -20,6 +20,7 @@ import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, ImageRefused, UsdBrdfError
 from usdbrdf.files.atomic import (
+    cure_of_writing,
     environment_failures,
     publish,
     raise_shortage,
@@ -42,8 +43,8 @@ MAX_SIDE = 65_536  # pixels
 MAX_PIXELS = 1 << 28
 MAX_CHANNELS = 64
 MAX_DECLARED_BYTES = 4 << 30
-MAX_INFLATION = 10_000  # declared bytes per stored byte, asked of images above so many bytes
-_ANY_INFLATION = 1 << 30
+# Declared bytes per stored byte, asked of images above so many bytes.
+MAX_INFLATION, _ANY_INFLATION = 10_000, 1 << 30
 # A display window may be larger than what the file holds; beyond this many bytes not by any factor.
 MAX_UNKNOWN_BYTES, MAX_UNKNOWN_SHARE = 64 << 20, 63 / 64
 HALF_MAX = 65_504.0
@@ -56,7 +57,6 @@ RAW_SUFFIXES = frozenset((
     ".pef", ".raf", ".raw", ".rw2", ".sr2", ".srf", ".srw", ".x3f",
 ))  # fmt: skip
 _CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
-
 _FOR_A_HEADER = 16 << 20  # bytes
 # As OpenImageIO and the libraries below it put it.
 _WANT_OF_MEMORY = re.compile(r"bad_alloc|out of memory|cannot allocate", re.IGNORECASE)
@@ -450,8 +450,8 @@ def write_image(path: Path, staged: Path, spec: Any, pixels: Any) -> None:
     # close() says True after a failed write, so it can only add a failure, never take one back.
     if not (output is not None and output.close() and done):
         raise EnvironmentFailure(
-            f"{path}: cannot be written ({message or 'closing failed'}). Free disk space or "
-            "correct the permission, then run the same command again. [image.write]"
+            f"{path}: cannot be written ({message or 'closing failed'}). "
+            f"{cure_of_writing(staged)}, then run the same command again. [image.write]"
         )
 
 
@@ -478,8 +478,7 @@ def refuse_other(path: Path, staged: Path, pixels: Float | Byte, *, holes: bool 
 def _refuse_other_jpeg(path: Path, staged: Path, spec: Any, rgb8: Byte) -> None:
     """The same of a JPEG, which reads back as other pixels: it is written once more elsewhere."""
     with scratch_folder(path) as folder:
-        again = folder / staged.name
-        write_image(path, again, spec, np.ascontiguousarray(rgb8))
+        write_image(path, again := folder / staged.name, spec, np.ascontiguousarray(rgb8))
         content = staged.read_bytes()
         if content != again.read_bytes() or not content.endswith(END):
             raise _not_as_written(path)

@@ -19,7 +19,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused
-from usdbrdf.files.atomic import publish, temporary_beside
+from usdbrdf.files.atomic import cure_of_writing, publish, temporary_beside
 from usdbrdf.files.colour import chromaticities_of
 from usdbrdf.files.images import open_image, pixels_of, refuse_other, write_image
 from usdbrdf.files.jpeg_bytes import JPEG_SUFFIXES, jpeg_without_metadata
@@ -79,8 +79,8 @@ def write_texture(
             made = oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, image, place, wanted)
         if not made:
             raise EnvironmentFailure(
-                f"{target}: cannot be written ({oiio.geterror()}). Free disk space or correct the "
-                "permission, then run the same command again. [image.write]"
+                f"{target}: cannot be written ({oiio.geterror()}). {cure_of_writing(staged)}, then "
+                "run the same command again. [image.write]"
             )
         # Smaller copies cannot be made around holes: they are filled.
         stored = pixels.astype(np.float16) if str(spec.format) == "half" else pixels

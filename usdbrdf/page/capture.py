@@ -165,7 +165,7 @@ def findings(
     if bounded := count.get("bounded"):
         told.append(
             f"{bounded} {_by_count(bounded, 'is', 'are')} bounded: photographs do not determine "
-            "both numbers, but hold the specular one below a bound."
+            "both numbers, but tell that highlights are weaker than usual, if there are any."
         )
     if unknown := count.get("undetermined"):
         told.append(

@@ -197,7 +197,8 @@ def why(
         return f"{explained} The target frame does not determine the numbers."
     sure = [name for name in ("phi", "psi") if getattr(fit, f"{name}_confidence") == "high"]
     known = f"Only {sure[0]} is determined." if sure else "Neither number is determined."
-    bound = f" psi is below {fit.psi_upper:.2f} with 95 %." if fit.psi_upper < 0.995 else ""
+    weak = "Its highlights, if it has any, are weaker than usual: " if status == "bounded" else ""
+    bound = f" {weak}psi is below {fit.psi_upper:.2f} with 95 %." if fit.psi_upper < 0.995 else ""
     return f"{explained} {known}{bound}"
 
 

@@ -117,7 +117,8 @@ class PageServer:
                 except (ValueError, RecursionError):
                     self._answer(400, b"no JSON")
                 except UsdBrdfError as error:
-                    self._answer(400, str(error).encode("utf-8"))
+                    # What it repeats may be a half of a pair, as JSON can have it.
+                    self._answer(400, str(error).encode("utf-8", "backslashreplace"))
                 else:
                     self._answer(200, b"saved")
 

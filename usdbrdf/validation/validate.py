@@ -15,11 +15,12 @@ from pathlib import Path
 from pxr import Sdf, Tf, Usd, UsdShade, UsdValidation
 
 from usdbrdf.asset.header import Provenance, new_layer, read_header
-from usdbrdf.asset.layout import Asset, version_around
+from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import in_one_line, no_warnings, try_in_child
-from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict, UsageError
-from usdbrdf.files.atomic import environment_failures, publish, temporary_beside
+from usdbrdf.errors import EnvironmentFailure, InputRefused, UsageError
+from usdbrdf.files.atomic import cure_of_writing, environment_failures, publish, temporary_beside
 from usdbrdf.job.ownership import reading
+from usdbrdf.job.versions import refuse_version
 from usdbrdf.validation import file_rules, material_rules, record_rules, review_rules, variant_rules
 from usdbrdf.validation.rule import (
     PREFIX,
@@ -205,14 +206,14 @@ class Cured:
 
 
 @contextmanager
-def _on_disk(path: Path) -> Iterator[None]:
-    """What USD says while it writes a file is about the disk."""
+def _on_disk(path: Path, written: Path) -> Iterator[None]:
+    """What USD says while it writes a file, to be ``path``, is about the disk."""
     try:
         yield
     except Tf.ErrorException as error:
         raise EnvironmentFailure(
-            f"{path}: USD could not write it ({in_one_line(error)}). Free disk space or correct "
-            "the permission, then run the same command again. [environment.io]"
+            f"{path}: USD could not write it ({in_one_line(error)}). {cure_of_writing(written)}, "
+            "then run the same command again. [environment.io]"
         ) from error
 
 
@@ -229,13 +230,7 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
     )
     if path.suffix != ".usda":
         raise UsageError(f"{path}: the cures are written as text; name a .usda file. [fix.suffix]")
-    if version_around(path) or (
-        asset.is_published and path.is_relative_to(asset.folder.absolute())
-    ):
-        raise OwnershipConflict(
-            f"{path}: a published version never changes. Cure the asset that it was published "
-            "from. [fix.published]"
-        )
+    refuse_version(path)
     if os.path.lexists(path):
         raise UsageError(taken)
     reserved = [asset.folder / name for name in ("layers", "textures", ".usdbrdf")]
@@ -253,7 +248,7 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
             "Cures by usdbrdf validate --fix. They take effect as the first sublayer of "
             f"{asset.root_layer.name}."
         )
-        with _on_disk(path):
+        with _on_disk(path, written):
             header.Export(str(written))
         cures = Sdf.Layer.FindOrOpen(str(written))
         # Stronger than all other layers, in memory alone.
@@ -268,7 +263,7 @@ def write_cures(asset: Asset, layer: Path) -> Cured:
         after = {complaint(found) for _, _, found in _curable(AssetStage(stage))}
         cured = tuple(found for found in applied if complaint(found) not in after)
         if cured:
-            with _on_disk(path):
+            with _on_disk(path, written):
                 cures.Save()
             _publish_new(written, path, taken)
     return Cured(layer=path, findings=cured)

@@ -5,10 +5,16 @@ The usdview and the Blender plug-in are installed apart: each has its copy of th
 
 _STATUS = {
     "measured": "MEASURED in the photographs",
-    "bounded": "BOUNDED, not measured: the photographs hold psi below a bound",
+    "bounded": "BOUNDED, not measured: highlights are weaker than usual, if there are any",
     "undetermined": "UNDETERMINED, not measured: what remains likely by the photographs",
     "unseen": "UNSEEN, not measured: no photograph shows enough of the object",
     "failed": "FAILED, not measured: the photograph does not determine the values",
+}
+_MODEL = {
+    "dielectric": "a colour under a gloss",
+    "diffuse": "a colour alone: no highlight was found",
+    "conductor": "a metal",
+    "transparent": "clear glass, which is not fitted",
 }
 _RADIANCE = {
     "measured": "measured in the photographs",
@@ -22,10 +28,12 @@ def fit_rows(facts):
 
     Facts that are absent are not known, and are told so; they are not replaced by defaults.
     """
-    rows = [("Object", _object(facts)), ("Status", _status(facts))]
-    rows += [
+    rows = [
+        ("Object", _object(facts)),
+        ("Status", _status(facts)),
+        ("Material", _material(facts)),
         ("Roughness phi", _parameter(facts, "phi")),
-        ("Specular psi", _parameter(facts, "psi")),
+        ("Specular psi", _parameter(facts, "psi") + _bound(facts)),
         ("Evidence", _number(facts, "usdBrdf:fit:evidence", "of the highlights explained")),
         ("Loss", _number(facts, "usdBrdf:fit:cost", "at its minimum")),
         ("Method", _method(facts)),
@@ -45,6 +53,19 @@ def _status(facts):
     status = facts.get("usdBrdf:fit:status", "")
     status = "undetermined" if status == "prior" else status  # in assets of older versions
     return _STATUS.get(status, f"{status or 'not fitted'}, not measured")
+
+
+def _material(facts):
+    # "kind" in assets of older versions
+    model = facts.get("usdBrdf:fit:model", facts.get("usdBrdf:fit:kind"))
+    unseen = facts.get("usdBrdf:fit:status", "unseen") == "unseen"
+    return "not known" if unseen and model != "transparent" else _MODEL.get(model, "not known")
+
+
+def _bound(facts):
+    upper = facts.get("usdBrdf:fit:psiUpper95", 1.0)
+    told = facts.get("usdBrdf:fit:status") != "measured" and upper < 0.995
+    return f", below {upper:.2g} with 95 %" if told else ""
 
 
 def _parameter(facts, name):

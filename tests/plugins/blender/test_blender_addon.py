@@ -215,6 +215,7 @@ def test_panels(session, room):
     assert told["nothing"] == [None, None]
     chair = labels(told["Stuhl_No_1"])
     assert "MEASURED in the photographs" in chair
+    assert "Material a colour under a gloss" in chair
     assert "0.25 ± 0.031 (confidence high)" in chair
     assert "0.5 ± 0.12 (confidence low)" in chair
     assert alerts(told["Stuhl_No_1"]) == ""

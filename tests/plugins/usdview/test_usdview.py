@@ -144,6 +144,7 @@ def test_the_fit_is_told(viewer):
         "/room/geo/Stuhl_No_1/Stuhl_No_1",
         "Object: Stuhl Nº 1 (chair)",
         "Status: MEASURED in the photographs",
+        "Material: a colour under a gloss",
         "Roughness phi: 0.25 ± 0.031 (confidence high)",
         "Specular psi: 0.5 ± 0.12 (confidence low)",
         "Evidence: 0.25 of the highlights explained",
@@ -153,6 +154,24 @@ def test_the_fit_is_told(viewer):
     ]
 
 
+@pytest.mark.parametrize(
+    ("model", "name", "told"),
+    [
+        ("diffuse", "model", "a colour alone: no highlight was found"),
+        ("conductor", "kind", "a metal"),  # as older versions called it
+        ("transparent", "model", "clear glass, which is not fitted"),
+    ],
+)
+def test_what_is_bounded_says_by_what_and_what_the_material_is(container, model, name, told):
+    from usdbrdf_usdview.fit_rows import fit_rows
+
+    facts = {"status": "bounded", name: model, "psi": 0.1, "psiError": 0.03, "psiUpper95": 0.117}
+    rows = dict(fit_rows({f"usdBrdf:fit:{fact}": value for fact, value in facts.items()}))
+    assert rows["Status"].startswith("BOUNDED, not measured: highlights are weaker than usual")
+    assert rows["Material"] == told
+    assert rows["Specular psi"] == "0.1 ± 0.03 (confidence none), below 0.12 with 95 %"
+
+
 def test_what_was_not_measured_says_so(viewer):
     viewer.select("/room/geo/wall/wall")
     viewer.menu.actions[INSPECT].trigger()
@@ -160,6 +179,7 @@ def test_what_was_not_measured_says_so(viewer):
     assert "Status: UNSEEN, not measured" in text
     # Not the schemas' fallbacks, which are numbers.
     assert "Roughness phi: not known" in text
+    assert "Material: not known" in text
     assert "Target frame: none" in text
 
 

@@ -19,7 +19,7 @@ from usdbrdf.asset.properties import Fact, known_facts
 from usdbrdf.asset.readers.compose import in_one_line
 from usdbrdf.asset.readers.tried import wrote
 from usdbrdf.errors import EnvironmentFailure, InputRefused, UsdBrdfError
-from usdbrdf.files.atomic import environment_failures, sha256_of, temporary_beside
+from usdbrdf.files.atomic import cure_of_writing, environment_failures, sha256_of, temporary_beside
 
 Types = Sdf.ValueTypeNames
 # As USD names a file that it was to compose; between @@@ a name that holds an @, in some versions.
@@ -156,17 +156,17 @@ def export(layer: Sdf.Layer, path: Path, *, folder: Path) -> None:
     When the disk is full USD leaves a truncated file in place of the old one: hence a name beside.
     """
     with temporary_beside(path) as written:
-        failure = EnvironmentFailure(
-            f"{path}: the USD layer could not be written completely. Free disk space or correct "
-            "the permission, then run the same command again. [environment.io]"
-        )
+        cause = None
         try:
             done = layer.Export(str(written))
             stored = Sdf.Layer.OpenAsAnonymous(str(written)) if done else None
         except Tf.ErrorException as error:
-            raise failure from error
+            stored, cause = None, error
         if not stored or stored.defaultPrim != layer.defaultPrim:
-            raise failure
+            raise EnvironmentFailure(
+                f"{path}: the USD layer could not be written completely. "
+                f"{cure_of_writing(written)}, then run the same command again. [environment.io]"
+            ) from cause
 
         def absolute(asset: str) -> str:
             return os.path.normpath(folder / asset) if asset.startswith(("./", "../")) else asset

@@ -18,7 +18,8 @@
     return made;
   }
   const fixed = (value, digits = 2) => (value === null || value === undefined ? '\u2013' : value.toFixed(digits));
-  const percent = (value, digits = 1) => (value === null ? '\u2013' : `${(100 * value).toFixed(digits)} %`);
+  // What rounds to nothing has no sign.
+  const percent = (value, digits = 1) => (value === null ? '\u2013' : `${(Number((100 * value).toFixed(digits)) + 0).toFixed(digits)} %`);
   const metres = (value) => `${value.toFixed(2)} m`;
   const STATUS = {
     measured: 'measured', bounded: 'bounded', undetermined: 'not determined', unseen: 'unseen', failed: 'failed', lamp: 'lamp',
@@ -186,7 +187,7 @@
   const css = (colour) => (colour ? `rgb(${colour.map(encoded).join(' ')})` : 'transparent');
   // Where psi is not known its deviation tells less than what it is below: the guess may be 0.
   const noMoreThan = (one) => (one.psi_upper !== null && one.psi_upper < 0.995 ? `below ${fixed(one.psi_upper)}` : 'up to 1');
-  const isGuess = (one) => one.psi !== null && one.psi_confidence === 'none';
+  const isGuess = (one) => one.psi !== null && (one.psi_confidence === 'none' || (one.because === 'bounded' && !one.f0));
   const certain = { high: 0, low: 1, none: 2 };
   const order = Object.keys(STATUS);
   const COLUMNS = [
@@ -205,7 +206,7 @@
 
   /* What the words of the trade say, for who judges without them. */
   const WORDS = {
-    Status: 'measured: the photographs determine roughness and specular. Bounded: they do not determine both, but hold specular below the number that is told. Not determined: no photograph shows a clear enough highlight. Of both, grey numbers are what remains likely. Unseen: no photograph shows enough of the object to measure anything; hardly shown: only together with what is beside it; too few pixels: enough for a colour, not for more. Seen through: its views contradict that it is a surface; clear glass: photographs show the outside through it. Left out: a person said that nothing be fitted, by ignore or glass.',
+    Status: 'measured: the photographs determine roughness and specular. Bounded: they do not determine both, but tell that highlights are weaker than usual: specular lies below the number that is told. Not determined: no photograph shows a clear enough highlight. Of both, grey numbers are what remains likely. Unseen: no photograph shows enough of the object to measure anything; hardly shown: only together with what is beside it; too few pixels: enough for a colour, not for more. Seen through: its views contradict that it is a surface; clear glass: photographs show the outside through it. Left out: a person said that nothing be fitted, by ignore or glass.',
     Colour: 'the mean of the base colour: what the object reflects to all sides, without highlights and without the light that fell on it.',
     'Roughness \u03c6': 'how wide highlights are: 0 a mirror, 1 matt (alpha of the GGX distribution; the roughness of most renderers is its square root). \u00b1: one standard deviation.',
     'Specular \u03c8': 'how strong they are: 0.5 is usual for wood, paint and plastics, 0 has none (what is mirrored straight ahead is 0.08 \u03c8 of the light). Of metals a colour, F0, takes its place.',
@@ -302,7 +303,7 @@
   function fill(entry) {
     const { one } = entry, cell = entry.detail.cells[0];
     const figure = (src, text) => el('figure', {}, el('img', { src, alt: `${one.label}: ${text}` }), el('figcaption', {}, text));
-    const pictures = el('div', {}, el('h3', {}, `Frame ${one.frame ?? '\u2013'}${one.frame === one.target ? ', which shows its highlight best' : ''}`),
+    const pictures = el('div', {}, el('h3', {}, `Frame ${one.frame ?? '\u2013'}${one.frame !== one.target ? '' : one.material === 'diffuse' ? ', where a highlight would show best' : ', which shows its highlight best'}`),
       el('div', { class: 'pair' },
         one.photograph ? figure(one.photograph, 'photograph') : null,
         one.model ? figure(one.model, 'model') : null));
