@@ -40,7 +40,7 @@ def test_settings_are_told_in_any_of_the_ways_of_the_standard(monkeypatch, said,
     assert exif_settings(None) == pytest.approx(Settings(*settings))
 
 
-def _photographs(tmp_path, said):
+def _made(tmp_path, said):
     """A room whose photographs say these EXIF data, by their numbers."""
     made = make_capture(tmp_path / "capture")
     with edited(made.manifest) as document:
@@ -55,7 +55,12 @@ def _photographs(tmp_path, said):
             assert output.write_image(np.full((24, 32, 3), 100 + i, np.uint8))
             assert output.close()
             made.image(i).unlink()
-    return read_scan(made.folder, IngestOptions(assume_srgb=True))
+    return made
+
+
+def _photographs(tmp_path, said):
+    """The scan of such a room."""
+    return read_scan(_made(tmp_path, said).folder, IngestOptions(assume_srgb=True))
 
 
 def test_exposures_in_stops_are_divided_out(tmp_path):
@@ -71,3 +76,56 @@ def test_apertures_that_some_photographs_do_not_tell_are_not_taken_for_f1(tmp_pa
     scan = _photographs(tmp_path, lambda i: told | ({"FNumber": 4.0} if i % 2 else {}))
     assert any("EXIF data are not compared" in sentence for sentence in scan.warnings)
     assert len(np.unique(scan.frames.saturation_radiance)) == 1
+
+
+def _stating(tmp_path, said, changes):
+    """What is told of a room whose document states ``changes`` by frames' numbers."""
+    made = _made(tmp_path, said)
+    with edited(made.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            frame |= changes(i)
+    scan = read_scan(made.folder, IngestOptions(assume_srgb=True))
+    return [w for w in scan.warnings if "EXIF" in w and "[capture.ldr]" not in w]
+
+
+@pytest.mark.fault("I15")
+def test_exposures_that_are_not_those_of_the_headers_are_told(tmp_path):
+    def header(i):
+        return {"ExposureTime": 0.01 * 2 ** (i % 3), "FNumber": 4.0, _ISO: 200}
+
+    def as_taken(i):
+        return {"exposure_time": 0.01 * 2 ** (i % 3)}
+
+    def one_wrong(i):
+        return {"exposure_time": 0.04 if i == 3 else 0.01 * 2 ** (i % 3)}
+
+    # ISO speed and f-number are the same in all: what all have in common does not count.
+    assert _stating(tmp_path / "right", header, as_taken) == []
+    (said,) = _stating(tmp_path / "wrong", header, one_wrong)
+    assert "of 1 of " in said
+    assert "by 2.0 stops beside the others in frames/0003.jpg" in said
+    assert said.endswith("[capture.exposure]")
+    # A camera that chooses its ISO speed by itself.
+    (said,) = _stating(tmp_path / "speeds", lambda i: header(i) | {_ISO: 100 << i % 3}, as_taken)
+    assert "by 1.0 stops" in said
+    assert _stating(tmp_path / "none", lambda i: {}, one_wrong) == []
+
+
+@pytest.mark.fault("I15")
+def test_a_focal_length_that_is_not_that_of_the_headers_is_told(tmp_path):
+    """Of 32 x 24 pixels, whose diagonal of 40 is 43.27 mm on film."""
+    made = _made(tmp_path / "room", lambda i: {})
+    focal = math.sqrt(math.prod(made.intrinsics[:2]))
+    usual = focal * math.hypot(36, 24) / 40
+
+    def told(name, millimetres):
+        return _stating(
+            tmp_path / name, lambda i: {"Exif:FocalLengthIn35mmFilm": millimetres}, lambda i: {}
+        )
+
+    assert told("right", round(usual)) == []
+    assert told("cropped", round(usual / 1.2)) == []
+    (said,) = told("wrong", round(2 * usual))
+    assert f"focal length that is stated, {focal:.0f} pixels" in said
+    assert f"is {usual / round(2 * usual):.2f} times" in said
+    assert said.endswith("[capture.lens]")

@@ -100,6 +100,26 @@ def test_the_convention_that_fits_is_named(capture, name, capsys):
     assert name in err
 
 
+@pytest.mark.fault("C17")
+@pytest.mark.parametrize(("by", "named"), [(1, "1 after"), (-1, "1 before"), (-2, "2 before")])
+@pytest.mark.parametrize("command", ["inspect", "ingest"])
+def test_poses_that_slipped_along_the_list_are_refused(
+    capture, tmp_path, capsys, by, named, command
+):
+    """As of who sorted frames and poses by different keys, or dropped one of either."""
+    with edited(capture.manifest) as document:
+        # Frames that follow each other show other things.
+        frames = document["frames"] = [document["frames"][7 * i % 24] for i in range(24)]
+        poses = [frame["transform_matrix"] for frame in frames]
+        for i, frame in enumerate(frames):
+            frame["transform_matrix"] = poses[(i - by) % len(poses)]
+    out = ["-o", str(tmp_path / "out")] if command == "ingest" else []
+    assert main([command, str(capture.folder), *out]) == 3
+    err = capsys.readouterr().err
+    assert f"with the poses read as those of the frames {named} them in the list" in err
+    assert err.endswith("Pair frames and poses anew. [capture.convention]\n")
+
+
 @pytest.mark.parametrize(
     ("factors", "named"),
     [

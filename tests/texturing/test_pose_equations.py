@@ -352,15 +352,18 @@ def test_a_value_s_sixteen_pixels_show_its_surface():
     row, column = np.mgrid[:8, :8].astype(np.float32)
     flat = np.stack([column, row, 0 * row], axis=-1)
     face, at = np.zeros((8, 8), np.int32), np.array([3.5, 4.5, 0.0])
-    # The farthest ones lie at (1.5, 1.5).
-    assert _is_surface(3, 4, at, 2.13, face, flat)
-    assert not _is_surface(3, 4, at, 2.12, face, flat)
+    towards = np.array([0.0, 0.6, 0.8])
+    # Along the plane any pixel may lie; off it, those of the farthest row, at 6, are 0.9 away.
+    assert _is_surface(3, 4, at, np.array([0.0, 0.0, 1.0]), 1e-9, face, flat)
+    assert _is_surface(3, 4, at, towards, 0.901, face, flat)
+    assert not _is_surface(3, 4, at, towards, 0.899, face, flat)
+    ahead = np.array([0.0, 0.0, -1.0])
     used = [(j, i) for j in range(3, 7) for i in range(2, 6)]
     for j in range(8):
         for i in range(8):
             hole, step = face.copy(), flat.copy()
             hole[j, i], step[j, i, 2] = -1, 3
-            assert _is_surface(3, 4, at, 2.5, hole, flat) == ((j, i) not in used)
-            assert _is_surface(3, 4, at, 2.5, face, step) == ((j, i) not in used)
-            step[j, i, 2] = 0.4
-            assert _is_surface(3, 4, at, 2.5, face, step)
+            assert _is_surface(3, 4, at, ahead, 2.5, hole, flat) == ((j, i) not in used)
+            assert _is_surface(3, 4, at, ahead, 2.5, face, step) == ((j, i) not in used)
+            step[j, i, 2] = 2.4
+            assert _is_surface(3, 4, at, ahead, 2.5, face, step)

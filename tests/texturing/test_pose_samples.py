@@ -114,6 +114,18 @@ def test_value_and_patch_are_those_of_the_pixel_that_a_point_lies_on():
     np.testing.assert_allclose(again.value, found.value[again.point], atol=0.02)
 
 
+@pytest.mark.parametrize("towards", [0.0, 1.2])
+def test_it_does_not_matter_where_in_its_pixel_a_point_lies(towards):
+    """In its middle too, from which the farthest of its pixels are two away each way; also of a
+    wall that is seen askew."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("y", -towards).as_matrix()
+    pose[:3, 3] = 3 * pose[:3, 2]
+    camera = camera_at(pose, LENS, WIDTH, HEIGHT)
+    at = [(12 + a, 20 + b) for a in (0.01, 0.5, 0.99) for b in (0.01, 0.5, 0.99)]
+    assert _shown(_points(camera, at), camera, _ramp()).point.tolist() == [*range(9)]
+
+
 def test_slopes_are_what_steps_of_the_camera_change():
     camera, step = _camera(), 1e-3
     surface = _points(camera, INNER)

@@ -1,16 +1,19 @@
-"""Do the cameras stand where a mesh can be seen from: apart, outside of things, before surfaces?"""
+"""Do the cameras stand where a mesh can be seen from: apart, outside of things, before surfaces?
+And are they what the photographs' own headers say?"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from usdbrdf.capture.checks import Findings, spread_evenly
+from usdbrdf.capture.checks import Findings, FrameRecord, spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS, UNITS
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.exif import exif_exposures, exif_focal_length
 from usdbrdf.geometry.sides import Sides
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
@@ -27,6 +30,9 @@ _LISTED = 3  # readings that are named
 # Of a mesh's vertices within a picture, from which on few hits mean that it is far away.
 _MIN_FRAMED_SHARE, _PROBED_POINTS = 0.8, 1000
 _MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
+# Stops by which stated exposures may differ from those of the headers, and times by which focal
+# lengths may: names on dials are rounded, pictures of films cropped.
+_EXIF_STOPS, _EXIF_TIMES = 1 / 3, 1.3
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
 
@@ -107,6 +113,48 @@ def warn_of_rolling_shutter(source: Path, findings: Findings) -> None:
         f"{source.name}: states a rolling_shutter, which is not undone: what a camera took while "
         "it moved is bent. Take frames with a camera that stands still. [capture.shutter]"
     )
+
+
+def doubts_about_headers(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
+    """A sentence where the exposures that a capture states of its photographs, or their focal
+    lengths, are not those of their EXIF data. What all exposures have in common does not count."""
+    yield from _exposures_told_otherwise(records, source)
+    yield from _lenses_told_otherwise(records, source)
+
+
+def _exposures_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
+    known, _ = exif_exposures([record.image_path for record in records])
+    if not known:
+        return
+    ratio = np.log2(known) - np.log2([record.exposure_time for record in records])
+    off = np.abs(ratio - np.median(ratio))
+    if off.max() > _EXIF_STOPS:
+        worst = int(off.argmax())
+        yield (
+            f"{source.name}: the exposures that are stated of {int((off > _EXIF_STOPS).sum())} of "
+            f"{len(records)} photographs are not those of their EXIF data (time, f-number and ISO "
+            f"speed), by {off[worst]:.1f} stops beside the others in {records[worst].name}, which "
+            f"are {known[worst]:.3g} beside {records[worst].exposure_time:.3g} as stated. The "
+            "stated ones are used: correct them, or state none, for the EXIF data to be used. "
+            "[capture.exposure]"
+        )
+
+
+def _lenses_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
+    """By the photographs' middle: of one alone the header may be another's."""
+    told = [(r, exif_focal_length(r.image_path, *r.resolution)) for r in records]
+    known = [(math.sqrt(math.prod(r.intrinsics[:2])), focal) for r, focal in told if focal]
+    if not known:
+        return
+    times = sorted(stated / focal for stated, focal in known)[len(known) // 2]
+    if max(times, 1 / times) > _EXIF_TIMES:
+        stated, focal = min(known, key=lambda one: abs(one[0] / one[1] - times))
+        yield (
+            f"{source.name}: the focal length that is stated, {stated:.0f} pixels, is {times:.2f} "
+            f"times that of the photographs' EXIF data, {focal:.0f} pixels at that size. Check "
+            "that the intrinsics are those of these photographs, at their size, and that these "
+            "were not cropped. [capture.lens]"
+        )
 
 
 def drop_cameras_inside(

@@ -14,6 +14,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.capture.camera_checks import (
+    doubts_about_headers,
     drop_cameras_inside,
     refuse_rays_that_miss,
     refuse_without_parallax,
@@ -465,6 +466,8 @@ def as_photographs(
         f"{source.name}: the images are 8-bit sRGB photographs, so the result is not radiometric: "
         f"colours and relative brightness only.{told} [capture.ldr]"
     )
+    for doubt in doubts_about_headers(records, source):
+        findings.warn(doubt)
     saturation, noise_floor = photograph_limits(np.array([r.exposure_time for r in records]))
     return [
         replace(r, saturation_radiance=float(high), noise_floor_radiance=float(low))

@@ -1,4 +1,4 @@
-"""How much light a photograph was given, by what its camera wrote into its header."""
+"""How much light a photograph was given, and by which lens, as its camera wrote into its header."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ _SPEEDS = (
     "Exif:StandardOutputSensitivity",
 )  # fmt: skip
 _NAMES = (_TIME, _STOPS, _NUMBER, _APERTURE, *_SPEEDS)
+_FOCAL = "Exif:FocalLengthIn35mmFilm"
+# Diagonal of a picture on 35 mm film, 36 x 24 mm.
+_FILM_DIAGONAL_MM = math.hypot(36, 24)
 
 
 class Settings(NamedTuple):
@@ -65,6 +68,17 @@ def exif_settings(path: Path) -> Settings:
 def exif_exposure(path: Path) -> float | None:
     """How much light a photograph was given, see ``Settings.light``."""
     return exif_settings(path).light
+
+
+def exif_focal_length(path: Path, width: int, height: int) -> float | None:
+    """Focal length, in pixels of the whole picture in that size, of a photograph whose EXIF data
+    tell that of a camera for 35 mm film with as large an angle of view; None where they do not, or
+    the file cannot be read, of which the reader of its pixels will tell."""
+    with suppress(ImageRefused):
+        (said,) = header_of(path, [_FOCAL])
+        if (millimetres := _positive(said)) is not None:
+            return millimetres / _FILM_DIAGONAL_MM * math.hypot(width, height)
+    return None
 
 
 def exif_exposures(paths: Sequence[Path]) -> tuple[list[float] | None, bool]:

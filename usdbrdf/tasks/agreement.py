@@ -3,7 +3,7 @@ as they are given or under another reading of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -32,11 +32,17 @@ from usdbrdf.transport.rays import RayScene
 
 ASKED = 16  # frames that are asked whether they agree
 _AS_GIVEN = ""
-_READINGS: dict[str, Callable[[Double], Double]] = {
+_CONVERTED: dict[str, Callable[[Double], Double]] = {
     _AS_GIVEN: lambda pose: pose,
     **CONVENTIONS,
     **UNITS,
 }
+# Poses that a list has some frames later, of a capture whose frames and poses were paired anew.
+_SHIFTED = {
+    f"those of the frames {abs(by)} {'after' if by > 0 else 'before'} them in the list": by
+    for by in (1, -1, 2, -2)
+}
+_READINGS = (*_CONVERTED, *_SHIFTED)
 # Of the points every so many are looked up under other readings at first.
 _STRIDE = 4
 
@@ -53,10 +59,18 @@ class Asked(NamedTuple):
 
 
 def agreement_of_frames(
-    surface: MeshPoints, rays: RayScene, frames: Frames, read: Read, source: Path
+    surface: MeshPoints,
+    rays: RayScene,
+    frames: Frames,
+    read: Read,
+    source: Path,
+    of_all: tuple[Double, Sequence[int]] | None = None,
 ) -> Asked:
     """What some frames, spread evenly, show. Of much the user is to be told by
     ``doubts_about_agreement``.
+
+    of_all  poses of all frames of the capture, and the numbers of ``frames`` among them; None where
+            these are all
 
     Raises InputRefused, in the name of ``source``, where they hardly do and would under another
     reading of the poses.
@@ -64,6 +78,11 @@ def agreement_of_frames(
     asked = spread_evenly(len(frames), ASKED)
     cameras = [frames.camera(i) for i in asked]
     pictures: dict[int, Float] = {}
+    poses, numbers = of_all or (frames.world_from_camera, range(len(frames)))
+
+    def read_as(name: str, i: int) -> Double:
+        own = (numbers[i] + _SHIFTED.get(name, 0)) % len(poses)
+        return _CONVERTED.get(name, _CONVERTED[_AS_GIVEN])(poses[own])
 
     def looked_up(steps: Mapping[str, int]) -> dict[str, Float]:
         """What the frames show, under some readings, at every so many points."""
@@ -75,8 +94,7 @@ def agreement_of_frames(
             if i not in pictures:  # which are halved further where the frames' sizes differ
                 pictures[i] = logarithms(pixels, max(1, pixels.valid.shape[1] // (2 * FINEST)))
             for name, step in steps.items():
-                pose = _READINGS[name](camera.world_from_camera)
-                other = replace(camera, world_from_camera=pose)
+                other = replace(camera, world_from_camera=read_as(name, i))
                 found[name].append(logarithms_in_frame(some[step], rays, other, pixels))
         return {name: np.stack(columns, axis=1) for name, columns in found.items()}
 
@@ -93,9 +111,10 @@ def agreement_of_frames(
     better = found.get(name := other_convention(given, found))
     if better is not None:
         differ = f"differ by {given.ratio:.0%} of what any two pixels do" if given else "share none"
+        cure = "Pair frames and poses anew" if name in _SHIFTED else "Convert the poses"
         raise InputRefused(
             f"{source}: the frames do not show the same things at the same points of the mesh "
             f"({differ}); with the poses read as {name} they would differ by {better.ratio:.0%}. "
-            "Convert the poses. [capture.convention]"
+            f"{cure}. [capture.convention]"
         )
     return Asked(given, rows, cameras, [*pictures.values()])

@@ -19,7 +19,7 @@ from usdbrdf.options import AUTO, InspectOptions
 from usdbrdf.tasks.agreement import ASKED, agreement_of_frames
 from usdbrdf.tasks.capture_inputs import no_asset
 from usdbrdf.tasks.objects import frames_that_tell_colours, segmented
-from usdbrdf.tasks.registration import doubts_about_registration
+from usdbrdf.tasks.registration import doubts_about_registration, doubts_about_steps
 from usdbrdf.tasks.turned import frames_to_compare, refuse_turned
 from usdbrdf.texturing.agreement import doubts_about_agreement, surface_and_rays
 from usdbrdf.texturing.astray import doubts_about_places, frames_astray
@@ -50,15 +50,19 @@ def inspect(
                 frames = developed_frames(numbers, folder)
                 read = partial(read_frame, frames)
                 refuse_turned(surface, rays, frames, found.turned_images, read, capture)
-            frames = developed_frames(spread_evenly(len(every), ASKED), folder)
+            numbers = spread_evenly(len(every), ASKED)
+            frames = developed_frames(numbers, folder)
             read = partial(read_frame, frames)
-            asked = agreement_of_frames(surface, rays, frames, read, capture)
+            of_all = every.world_from_camera, numbers
+            asked = agreement_of_frames(surface, rays, frames, read, capture, of_all)
             names = [path.name for path in frames.image_paths]
             doubts = [*doubts_about_agreement(asked.agreement, capture)]
             astray = frames_astray(asked.shown)
-            doubts += doubts_about_places(astray, names, capture)
             metres = found.meters_per_unit or 1.0
             doubts += doubts_about_registration(mesh, rays, asked, astray, capture, metres)
+            if not doubts:
+                doubts += doubts_about_steps(mesh, rays, asked, astray, capture)
+            doubts += doubts_about_places(astray, names, capture)
             objects = found.objects
             if options.objects == AUTO:
                 frames = developed_frames(frames_that_tell_colours(mesh, len(every)), folder)

@@ -29,11 +29,19 @@ _ASKED, _LISTED = 32, 6
 
 
 def asked_of_its_optics(
-    scan: Scan, surface: MeshPoints, rays: RayScene, read: Read, *, estimate: bool
+    scan: Scan,
+    surface: MeshPoints,
+    rays: RayScene,
+    read: Read,
+    *,
+    estimate: bool,
+    in_place: bool = True,
 ) -> tuple[Scan, dict[str, Any], list[str]]:
     """The scan, its frames' vignetting to be divided out if ``estimate``; what was found: stops
     that corners are darker by, and that the balance of red or blue to green is off by in the worst
-    frame; and a sentence for the user on each of them that is much, and on frames astray."""
+    frame; and a sentence for the user on each of them that is much, and on frames astray. Where
+    frames are known not to be ``in_place``, their balance seems to drift by that alone, and nothing
+    is said of it."""
     frames = scan.frames
     asked = spread_evenly(len(frames), _ASKED)
     images = read_frames(read, asked)
@@ -56,7 +64,7 @@ def asked_of_its_optics(
         )
         if estimate:
             scan = replace(scan, frames=replace(frames, vignetting=falloff.coefficients))
-    if drift is not None and drifts(drift).any():
+    if drift is not None and drifts(drift).any() and in_place:
         off = [names[k] for k in np.flatnonzero(drifts(drift))]
         doubts.append(
             f"{scan.source.name}: the white balance of {len(off)} of {len(asked)} frames is off "

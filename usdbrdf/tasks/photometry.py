@@ -21,7 +21,7 @@ from usdbrdf.tasks.agreement import agreement_of_frames
 from usdbrdf.tasks.objects import segmented
 from usdbrdf.tasks.optics import asked_of_its_optics
 from usdbrdf.tasks.poses import with_refined_poses
-from usdbrdf.tasks.registration import doubts_about_registration
+from usdbrdf.tasks.registration import doubts_about_registration, doubts_about_steps
 from usdbrdf.tasks.task import warned
 from usdbrdf.tasks.turned import refuse_turned
 from usdbrdf.texturing.agreement import (
@@ -51,8 +51,13 @@ def asked_of_its_pixels(
     warnings += warned(
         doubts_about_registration(scan.mesh, rays, asked, astray, scan.source, metres)
     )
+    in_place = not warnings
+    if in_place and not options.refine_poses:
+        warnings += warned(doubts_about_steps(scan.mesh, rays, asked, astray, scan.source))
     estimate = options.vignetting == "estimate"
-    scan, told, doubts = asked_of_its_optics(scan, surface, rays, read, estimate=estimate)
+    scan, told, doubts = asked_of_its_optics(
+        scan, surface, rays, read, estimate=estimate, in_place=in_place
+    )
     warnings += warned(doubts)
     told |= {"agreement": agrees and agrees.ratio, "warnings": warnings}
     read = partial(read_frame, replace(scan.frames, image_paths=tuple(images)))

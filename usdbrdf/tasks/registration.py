@@ -1,15 +1,17 @@
 """Whether the lens of a scan's frames, as it is told, is the one that they were taken with, and
-whether their poses as a whole belong to its mesh."""
+whether their poses belong to its mesh, as a whole and each by itself."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 
-from usdbrdf.model.arrays import Bool
+from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.tasks.agreement import Asked
 from usdbrdf.texturing.registration.lens import lens_of_frames, said_of_lens
+from usdbrdf.texturing.registration.own_steps import own_steps_of_frames, said_of_own_steps
 from usdbrdf.texturing.registration.similarity import said_of_similarity, similarity_of_frames
 from usdbrdf.transport.rays import RayScene
 
@@ -22,12 +24,32 @@ def doubts_about_registration(
 
     metres  of a unit of the mesh
     """
-    some = [i for i, off in enumerate(astray) if not off]
-    cameras = [asked.cameras[i] for i in some]
-    pictures = [asked.pictures[i] for i in some]
+    cameras, pictures = _of_others(asked, astray)
     lens = lens_of_frames(mesh, rays, cameras, pictures)
     poses = similarity_of_frames(mesh, rays, cameras, pictures)
     if poses and poses.is_clear and (lens is None or poses.found.left < lens.left):
+        # Of poses that tremble some similarity fits best by chance, and they tremble after it.
+        moved = [poses.found.change.camera(camera) for camera in cameras]
+        left = own_steps_of_frames(mesh, rays, moved, pictures)
+        if left and left.is_clear:
+            return
         yield said_of_similarity(poses, source, 1000 * metres)
     elif lens and lens.is_clear:
         yield said_of_lens(lens, source)
+
+
+def doubts_about_steps(
+    mesh: ScanMesh, rays: RayScene, asked: Asked, astray: Bool, source: Path
+) -> Iterator[str]:
+    """The same on poses each of which is off by itself; to be asked where nothing that all frames
+    share is off, for then each seems to be."""
+    cameras, pictures = _of_others(asked, astray)
+    found = own_steps_of_frames(mesh, rays, cameras, pictures)
+    if found and found.is_clear:
+        yield said_of_own_steps(found, source, cameras[0].width)
+
+
+def _of_others(asked: Asked, astray: Bool) -> tuple[list[Camera], list[Float]]:
+    """Cameras and pictures of the frames that were asked, but those that are ``astray``."""
+    some = [i for i, off in enumerate(astray) if not off]
+    return [asked.cameras[i] for i in some], [asked.pictures[i] for i in some]

@@ -15,8 +15,8 @@ from usdbrdf.texturing.agreement import MIN_COSINE, MeshPoints
 from usdbrdf.texturing.samples import Projection
 from usdbrdf.transport.rays import RayScene
 
-# Farther than this many pixels from a point, seen from the front, its neighbours in the picture
-# belong to something behind or before it.
+# Farther than this many pixels, seen from the front, off the plane of a point's surface its
+# neighbours in the picture belong to something behind or before it.
 _BESIDE = 2.5
 # Pixels beside a picture's border in which nothing is looked up.
 _INSET = 2
@@ -124,8 +124,7 @@ def _look_up(
         if not (_INSET <= u < width - 1 - _INSET and _INSET <= v < height - 1 - _INSET):
             continue
         i, j = int(np.floor(u)), int(np.floor(v))
-        farthest = -z / fx * _BESIDE / cosine
-        if not _is_surface(i, j, p, farthest, face, seen):
+        if not _is_surface(i, j, p, n, -z / fx * _BESIDE, face, seen):
             continue
         a, b = u - i, v - j
         middle = _between(picture, i, j, a, b)
@@ -152,15 +151,18 @@ def _between(picture: Float, i: int, j: int, a: float, b: float) -> float:
 
 
 @kernel
-def _is_surface(i: int, j: int, p: Double, farthest: float, face: Int, seen: Float) -> bool:
-    """Do all pixels that make up a value show something near its point?"""
+def _is_surface(
+    i: int, j: int, p: Double, n: Double, farthest: float, face: Int, seen: Float
+) -> bool:
+    """Do all pixels that make up a value show something near the plane through its point p, across
+    n? Along that plane they are as far from it as pixels are, wherever in its own it lies."""
     for row in range(j - 1, j + 3):
         for column in range(i - 1, i + 3):
             if face[row, column] < 0:
                 return False
             off = 0.0
             for k in range(3):
-                off += (seen[row, column, k] - p[k]) ** 2
-            if off > farthest * farthest:
+                off += n[k] * (seen[row, column, k] - p[k])
+            if abs(off) > farthest:
                 return False
     return True
