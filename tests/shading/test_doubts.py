@@ -8,7 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from usdbrdf.shading.shaded import Shaded, _doubt
+from usdbrdf.shading.doubt import doubt_of_irradiance, doubt_of_outside
+from usdbrdf.shading.outside import Outside
+from usdbrdf.shading.shaded import Shaded
+from usdbrdf.transport.environment import NO_SUN, Environment, Sun
 
 
 def _shaded(
@@ -74,6 +77,29 @@ def test_an_open_scan_whose_surroundings_are_given_is_no_doubt(estimated):
     assert all("--environment to measure it" in doubt for doubt in doubts)
 
 
+SUN = Sun(np.array([0.0, 0.0, 1.0]), np.full(3, 10.0))
+
+
+def _outside(sun: Sun, **known: float) -> Outside:
+    """Of a sky of radiance 2."""
+    sky, confidence = np.full((4, 8, 3), 2, np.float32), np.zeros((4, 8), np.float32)
+    return Outside(environment=Environment(sky, True).under(sun), confidence=confidence, **known)
+
+
+def test_a_sky_is_doubted_as_far_as_it_lights_the_room():
+    """Through a crack comes next to nothing, however badly the sky behind it is known."""
+    lit, seen = np.float32([[0.5] * 3, [0.5] * 3, [9] * 3]), np.array([True, True, False])
+    crack = _outside(NO_SUN, open_share=0.01, sky_error=4.0)
+    assert doubt_of_outside(crack, lit, seen) == pytest.approx(4 * 0.01 * 2 / 0.5)
+    window = replace(crack, open_share=0.4)
+    assert doubt_of_outside(window, lit, seen) == 4
+    # All the light of a patch may be the sun's.
+    assert doubt_of_outside(_outside(SUN, open_share=0.01, sun_error=0.3), lit, seen) == 0.3
+    assert doubt_of_outside(Outside.given(crack.environment), lit, seen) == 0
+    assert doubt_of_outside(window, lit, ~np.ones(3, np.bool_)) == 0
+    assert doubt_of_outside(None, lit, seen) == 0
+
+
 def test_light_is_doubted_as_the_lamps_that_bring_most_of_it():
     """Two lamps that clip, the second undetermined, and one that no frame shows."""
     texels = SimpleNamespace(
@@ -90,21 +116,23 @@ def test_light_is_doubted_as_the_lamps_that_bring_most_of_it():
     )
     none = SimpleNamespace(object=np.zeros(0, np.int32), error=np.zeros(0, np.float32))
     unseen = SimpleNamespace(object=np.array([3], np.int32), error=np.array([0.4], np.float32))
-    outside = SimpleNamespace(doubt=0.15)
+    outside = _outside(SUN, open_share=0.5, sky_error=0.15)
     dark, seen = np.zeros((8, 3), np.float32), np.repeat([True, False, False, True], 2)
-    assert _doubt(texels, clipped, none, None, seen, dark) == pytest.approx(0.2)
-    assert _doubt(texels, clipped, none, outside, seen, dark) == pytest.approx(0.25)
+    assert doubt_of_irradiance(texels, clipped, none, None, seen, dark) == pytest.approx(0.2)
+    assert doubt_of_irradiance(texels, clipped, none, outside, seen, dark) == pytest.approx(0.25)
     # The one weighs three times as much as the other.
     both = np.hypot(0.75 * 0.2, 0.25 * 0.4)
-    assert _doubt(texels, clipped, unseen, None, seen, dark) == pytest.approx(both)
+    assert doubt_of_irradiance(texels, clipped, unseen, None, seen, dark) == pytest.approx(both)
     # Walls keep less than the lamp sends, or much more: then there is other light. What falls on
     # what nobody saw, as the outside of walls, is none of theirs.
     for level, share in ((2, 1), (11, 3 / 20)):
         light = np.full((8, 3), level * np.pi, np.float32)
         light[~seen] *= 100
-        assert _doubt(texels, clipped, none, None, seen, light) == pytest.approx(0.2 * share)
+        assert doubt_of_irradiance(texels, clipped, none, None, seen, light) == pytest.approx(
+            0.2 * share
+        )
     clipped.estimate.determined[:] = False
-    assert _doubt(texels, clipped, none, None, seen, dark) == 0
+    assert doubt_of_irradiance(texels, clipped, none, None, seen, dark) == 0
 
 
 @pytest.mark.parametrize("hidden", [True, False])

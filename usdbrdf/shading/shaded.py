@@ -24,6 +24,7 @@ from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.base_color import albedo_map, clear_of
 from usdbrdf.shading.clipped_groups import clipped_groups
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
+from usdbrdf.shading.doubt import doubt_of_irradiance, doubt_of_outside
 from usdbrdf.shading.hidden_light import KnownLamps, said_to_shine, with_hidden_light
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.panes import beside_panes
@@ -362,7 +363,8 @@ def _light(
 ) -> tuple[ClippedLight, UnseenLamps]:
     """L_d with what hidden surfaces send on, and with the lamps that no frame measures."""
     environment = outside.environment if outside else black_environment()
-    texels, filled, doubt = surface.texels, lit, outside.doubt if outside else 0.0
+    texels, filled = surface.texels, lit
+    doubt = doubt_of_outside(outside, lit, coverage.measured)
     owner = texels.object_index()
     groups = clipped_groups(texels, lit, coverage, said)
     told = said_to_shine(texels, said)
@@ -417,35 +419,6 @@ def _lit_by_unseen_lamps(
     return lit, unseen
 
 
-def _doubt(
-    texels: Texels,
-    light: ClippedLight,
-    unseen: UnseenLamps,
-    outside: Outside | None,
-    measured: Bool,
-    irradiance: Float,
-) -> float:
-    """Relative standard error of S by what lights the scan and is inferred: the lamps that clip or
-    that no frame shows, weighed by their power, and what is outside. All lamps, measured ones and
-    the sky too, send at least what ``measured`` surfaces do not send on of S, ``irradiance``
-    (T, 3): the sky falls on the outside of walls too, which lights nothing that was measured."""
-    clipped, owner = light.groups, texels.object_index()
-    lamps = [
-        (float(light.estimate.standard_error[k].max()), clipped.group == k)
-        for k in np.flatnonzero(clipped.lamp & light.estimate.determined)
-    ]
-    numbers = zip(unseen.error.tolist(), unseen.object.tolist(), strict=True)
-    lamps += [(error, owner == number) for error, number in numbers]
-    power, doubt, inferred = 0.0, 0.0, np.zeros(len(texels.area), np.bool_)
-    for error, own in lamps:
-        one = float(texels.area[own] @ light.lit[own].mean(axis=1))
-        power, doubt, inferred = power + one, math.hypot(doubt, error * one), inferred | own
-    kept = np.maximum(irradiance / np.pi - light.lit, 0).mean(axis=1)
-    told = measured & ~inferred
-    every = max(power, float(texels.area[told] @ kept[told]), 1e-30)
-    return math.hypot(doubt / every, outside.doubt if outside else 0.0)
-
-
 def shade_surface(
     run: TaskRun,
     surface: TexturedScene,
@@ -477,7 +450,7 @@ def shade_surface(
     light = replace(light, lit=np.where(panes[:, None], lit, light.lit))
     texels, seen = surface.texels, coverage.measured
     may_shine = light.may_shine(coverage.clipped)
-    doubt = _doubt(texels, light, unseen, outside, seen, irradiance)
+    doubt = doubt_of_irradiance(texels, light, unseen, outside, seen, irradiance)
     dimmest = light.least_of_lamps(clear_of(doubt) / np.pi * irradiance.max(axis=1))
     emitters = find_emitters(
         texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt,
