@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shutil
+from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -10,7 +12,10 @@ import pytest
 
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.capture.camera_checks import doubts_about_headers
+from usdbrdf.capture.checks import FrameRecord
 from usdbrdf.files.exif import Settings, exif_settings
+from usdbrdf.model.lens import Lens
 from usdbrdf.options import IngestOptions
 
 _ISO = "Exif:PhotographicSensitivity"
@@ -129,3 +134,50 @@ def test_a_focal_length_that_is_not_that_of_the_headers_is_told(tmp_path):
     assert f"focal length that is stated, {focal:.0f} pixels" in said
     assert f"is {usual / round(2 * usual):.2f} times" in said
     assert said.endswith("[capture.lens]")
+
+
+@pytest.mark.fault("I15")
+def test_of_a_digital_zoom_either_reading_of_the_headers_is_believed(tmp_path):
+    made = _made(tmp_path / "room", lambda i: {})
+    film = math.sqrt(math.prod(made.intrinsics[:2])) * math.hypot(36, 24) / 40
+
+    def told(name, millimetres):
+        zoomed = {"Exif:FocalLengthIn35mmFilm": millimetres, "Exif:DigitalZoomRatio": 2.0}
+        return _stating(tmp_path / name, lambda i: zoomed, lambda i: {})
+
+    assert told("with", round(film)) == []
+    assert told("without", round(film / 2)) == []
+    assert len(told("neither", round(4 * film))) == 1
+
+
+def test_headers_are_held_against_what_they_are_of(tmp_path):
+    """Not against another file's where one cannot be read; and two halves have no middle."""
+
+    def record(i, **known):
+        camera = {"world_from_camera": np.eye(4), "intrinsics": (30.0, 30.0, 16.0, 12.0)}
+        path = tmp_path / "room" / "capture" / "frames" / f"{i:04d}.jpg"
+        return FrameRecord(name=path.name, image_path=path, resolution=(32, 24), **camera, **known)
+
+    def told(stated, **known):
+        records = [record(i, exposure_time=stated(i), **known) for i in range(10)]
+        return [*doubts_about_headers(records, Path("room"), exposures_are_stated=True)]
+
+    _made(tmp_path / "room", lambda i: {"ExposureTime": 0.01 * 2 ** (i % 3)})
+    assert told(lambda i: 0.01 * 2 ** (i % 3)) == []
+    (said,) = told(lambda i: 0.01 * 2 ** (i % 3) * (4 if i % 2 else 1))
+    assert "of 5 of 10" in said
+    assert "by 2.0 stops" in said
+    record(4).image_path.write_bytes(b"cut off")
+    assert told(lambda i: 0.01 * 2 ** (i % 3)) == []
+    # A stitcher copies the headers of what it was given.
+    focal = {"Exif:FocalLengthIn35mmFilm": 5}
+    for file in (tmp_path / "room" / "capture" / "frames").iterdir():
+        file.unlink()
+    _made(tmp_path / "other", lambda i: focal)
+    shutil.copytree(
+        tmp_path / "other" / "capture" / "frames",
+        tmp_path / "room" / "capture" / "frames",
+        dirs_exist_ok=True,
+    )
+    assert len(told(lambda i: 1.0)) == 1
+    assert told(lambda i: 1.0, lens=Lens(curve="equirectangular")) == []

@@ -147,5 +147,9 @@ def test_an_asset_with_a_usd_file_beside_its_own_is_no_version(places):
     folder = shutil.copytree(places.asset, places.top / "room")
     (folder / "flat.usd").touch()
     refuse_version(folder / "fixes.usda")
+    shots = places.top / "v012"
+    shots.mkdir()
+    (shots / "manifest.json").touch()  # of another program's folder of versions
+    refuse_version(shots / "new")
     (places.capture / "capture.usd").touch()
     refuse_version(places.capture / "new")

@@ -13,6 +13,7 @@ import usdbrdf
 from tests.scenes import edited
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.files.frames import read_frame
+from usdbrdf.files.images import read_exr, write_exr
 from usdbrdf.model.upright import as_captured
 from usdbrdf.options import IngestOptions, InspectOptions
 from usdbrdf.tasks import registration
@@ -74,7 +75,7 @@ def test_a_similarity_after_which_they_tremble_still_is_not_told(study, monkeypa
 
     def by_chance(*_):
         none = Similarity((0.0, 0.0, 0.0), 1.0)
-        found = Found(none, 0.02, 1e-3, 14, 14, 0.8, 0.5, np.eye(7))
+        found = Found(none, 0.02, 1e-3, 14, 14, 0.94, 0.5, np.eye(7))
         return SimilarityCheck(found, (found, found))
 
     monkeypatch.setattr(registration, "similarity_of_frames", by_chance)
@@ -83,6 +84,23 @@ def test_a_similarity_after_which_they_tremble_still_is_not_told(study, monkeypa
         asked = Asked(None, np.empty((0, len(poses))), poses, pictures)
         said = registration.doubts_about_registration(mesh, rays, asked, right, SOURCE, 1.0)
         assert len(list(said)) == told
+
+
+@pytest.mark.fault("C19")
+def test_a_scale_of_poses_that_tremble_is_told(study):
+    """It explains more than what is left for steps."""
+    mesh, rays, cameras, pictures = study
+    eyes = np.stack([camera.eye for camera in cameras])
+    scaled = []
+    for camera, eye in zip(_trembling(cameras, 10), eyes, strict=True):
+        pose = camera.world_from_camera.copy()
+        pose[:3, 3] += 0.06 * (eye - eyes.mean(axis=0))
+        scaled.append(replace(camera, world_from_camera=pose))
+    asked = Asked(None, np.empty((0, len(cameras))), scaled, pictures)
+    right = np.zeros(len(cameras), bool)
+    (said,) = registration.doubts_about_registration(mesh, rays, asked, right, SOURCE, 1.0)
+    assert said.endswith("[capture.registration]")
+    assert "scaled by" in said
 
 
 def test_poses_that_are_right_are_believed(study):
@@ -144,3 +162,16 @@ def test_colours_of_frames_that_show_other_places_are_not_said_to_drift(tmp_path
         found = usdbrdf.ingest(capture, asset, IngestOptions()).summary
     assert found["white_balance_drift_stops"] > 0.1
     assert _codes(found["warnings"]) == ["[capture.lens]"]
+
+
+def test_exposures_that_are_wrong_hide_no_drift_of_colours(tmp_path):
+    """Poses are where they are, though frames hardly agree."""
+    capture = _capture(tmp_path / "scan", lambda document: None)
+    rng = np.random.default_rng(1)
+    frames = sorted((capture / "frames").iterdir())[::4]
+    for i, file in enumerate(frames):
+        tint = 2 ** (0.6 * (i / (len(frames) - 1) - 0.5))
+        write_exr(file, read_exr(file) * np.exp(rng.normal(0, 0.9)) * [tint, 1, 1 / tint])
+    with usdbrdf.working_on(tmp_path / "asset") as asset:
+        found = usdbrdf.ingest(capture, asset, IngestOptions()).summary
+    assert _codes(found["warnings"]) == ["[capture.agreement]", "[capture.balance]"]

@@ -13,7 +13,7 @@ import numpy as np
 from usdbrdf.capture.checks import Findings, FrameRecord, spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS, UNITS
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.exif import exif_exposures, exif_focal_length
+from usdbrdf.files.exif import exif_focal_lengths, exif_lights
 from usdbrdf.geometry.sides import Sides
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Frames
@@ -115,38 +115,50 @@ def warn_of_rolling_shutter(source: Path, findings: Findings) -> None:
     )
 
 
-def doubts_about_headers(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
+def doubts_about_headers(
+    records: Sequence[FrameRecord], source: Path, *, exposures_are_stated: bool
+) -> Iterator[str]:
     """A sentence where the exposures that a capture states of its photographs, or their focal
     lengths, are not those of their EXIF data. What all exposures have in common does not count."""
-    yield from _exposures_told_otherwise(records, source)
+    if exposures_are_stated:
+        yield from _exposures_told_otherwise(records, source)
     yield from _lenses_told_otherwise(records, source)
 
 
 def _exposures_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
-    known, _ = exif_exposures([record.image_path for record in records])
-    if not known:
+    lights = exif_lights([record.image_path for record in records])
+    told = [record for record in records if record.image_path in lights]
+    if not told:
         return
-    ratio = np.log2(known) - np.log2([record.exposure_time for record in records])
-    off = np.abs(ratio - np.median(ratio))
+    known = np.array([lights[record.image_path] for record in told])
+    ratio = np.log2(known) - np.log2([record.exposure_time for record in told])
+    off = np.abs(ratio - _middle(ratio.tolist()))
     if off.max() > _EXIF_STOPS:
         worst = int(off.argmax())
         yield (
             f"{source.name}: the exposures that are stated of {int((off > _EXIF_STOPS).sum())} of "
-            f"{len(records)} photographs are not those of their EXIF data (time, f-number and ISO "
-            f"speed), by {off[worst]:.1f} stops beside the others in {records[worst].name}, which "
-            f"are {known[worst]:.3g} beside {records[worst].exposure_time:.3g} as stated. The "
+            f"{len(told)} photographs are not those of their EXIF data (time, f-number and ISO "
+            f"speed), by {off[worst]:.1f} stops beside the others in {told[worst].name}, which "
+            f"are {known[worst]:.3g} beside {told[worst].exposure_time:.3g} as stated. The "
             "stated ones are used: correct them, or state none, for the EXIF data to be used. "
             "[capture.exposure]"
         )
 
 
 def _lenses_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
-    """By the photographs' middle: of one alone the header may be another's."""
-    told = [(r, exif_focal_length(r.image_path, *r.resolution)) for r in records]
-    known = [(math.sqrt(math.prod(r.intrinsics[:2])), focal) for r, focal in told if focal]
+    """By the photographs' middle: of one alone the header may be another's. A whole sphere has no
+    focal length, whatever the headers say, which are those of the pictures that it was made of."""
+    known = []
+    for record in records:
+        if record.lens.curve == "equirectangular":
+            continue
+        stated = math.sqrt(math.prod(record.intrinsics[:2]))
+        if told := exif_focal_lengths(record.image_path, *record.resolution):
+            off = np.abs(np.log(stated / np.array(told)))
+            known.append((stated, told[int(off.argmin())]))
     if not known:
         return
-    times = sorted(stated / focal for stated, focal in known)[len(known) // 2]
+    times = _middle([stated / focal for stated, focal in known])
     if max(times, 1 / times) > _EXIF_TIMES:
         stated, focal = min(known, key=lambda one: abs(one[0] / one[1] - times))
         yield (
@@ -155,6 +167,11 @@ def _lenses_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iter
             "that the intrinsics are those of these photographs, at their size, and that these "
             "were not cropped. [capture.lens]"
         )
+
+
+def _middle(values: Sequence[float]) -> float:
+    """One of them: what lies between two halves is nobody's."""
+    return sorted(values)[(len(values) - 1) // 2]
 
 
 def drop_cameras_inside(

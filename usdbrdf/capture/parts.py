@@ -448,7 +448,8 @@ def as_photographs(
     """8-bit sRGB records with the limits of such images, brought to one exposure: the stated one,
     else that of all images' EXIF data."""
     told = ""
-    if all(record.exposure_time == 1 for record in records):
+    stated = any(record.exposure_time != 1 for record in records)
+    if not stated:
         known, any_told = exif_exposures([record.image_path for record in records])
         if known:
             records = [
@@ -466,7 +467,7 @@ def as_photographs(
         f"{source.name}: the images are 8-bit sRGB photographs, so the result is not radiometric: "
         f"colours and relative brightness only.{told} [capture.ldr]"
     )
-    for doubt in doubts_about_headers(records, source):
+    for doubt in doubts_about_headers(records, source, exposures_are_stated=stated):
         findings.warn(doubt)
     saturation, noise_floor = photograph_limits(np.array([r.exposure_time for r in records]))
     return [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +23,7 @@ _SPEEDS = (
     "Exif:StandardOutputSensitivity",
 )  # fmt: skip
 _NAMES = (_TIME, _STOPS, _NUMBER, _APERTURE, *_SPEEDS)
-_FOCAL = "Exif:FocalLengthIn35mmFilm"
+_FOCAL, _ZOOM = "Exif:FocalLengthIn35mmFilm", "Exif:DigitalZoomRatio"
 # Diagonal of a picture on 35 mm film, 36 x 24 mm.
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 
@@ -70,32 +70,44 @@ def exif_exposure(path: Path) -> float | None:
     return exif_settings(path).light
 
 
-def exif_focal_length(path: Path, width: int, height: int) -> float | None:
+def exif_focal_lengths(path: Path, width: int, height: int) -> list[float]:
     """Focal length, in pixels of the whole picture in that size, of a photograph whose EXIF data
-    tell that of a camera for 35 mm film with as large an angle of view; None where they do not, or
-    the file cannot be read, of which the reader of its pixels will tell."""
+    tell that of a camera for 35 mm film with as large an angle of view; of a digital zoom it may
+    tell that before it or after, and both are returned. None where they do not tell it, or the file
+    cannot be read, of which the reader of its pixels will tell."""
     with suppress(ImageRefused):
-        (said,) = header_of(path, [_FOCAL])
-        if (millimetres := _positive(said)) is not None:
-            return millimetres / _FILM_DIAGONAL_MM * math.hypot(width, height)
-    return None
+        said, zoom = map(_positive, header_of(path, [_FOCAL, _ZOOM]))
+        if said is not None:
+            pixels = said / _FILM_DIAGONAL_MM * math.hypot(width, height)
+            return [pixels * times for times in {1.0, max(zoom or 1.0, 1.0)}]
+    return []
+
+
+def exif_lights(paths: Sequence[Path]) -> dict[Path, float]:
+    """The light of each of several photographs, see ``Settings.light``, but of those that cannot be
+    read, of which the reader of their pixels will tell; none where it cannot be compared, as some
+    tell a time, an f-number or a speed and others do not."""
+    return _comparable(_readable_settings(paths))
 
 
 def exif_exposures(paths: Sequence[Path]) -> tuple[list[float] | None, bool]:
-    """The light of each of several photographs, None where it cannot be compared, as some tell a
-    time, an f-number or a speed and others do not; and whether any tells anything. Files that
-    cannot be read, of which the reader of their pixels will tell, have that of another."""
+    """The same of all of them, those that cannot be read with that of another, None where it cannot
+    be compared; and whether any tells anything."""
     known = _readable_settings(paths)
-    columns = list(zip(*known.values(), strict=True))
-    alike = all(len({one is None for one in column}) == 1 for column in columns)
-    lights = {path: settings.light for path, settings in known.items()}
+    lights = _comparable(known)
     other = next(iter(lights.values()), None)
-    found = [lights.get(path) or other for path in paths]
-    exposures = [light for light in found if alike and light is not None]
+    found = [lights.get(path, other) for path in paths]
+    exposures = [light for light in found if light is not None]
     return (
         exposures if len(exposures) == len(paths) else None,
-        any(one is not None for column in columns for one in column),
+        any(one is not None for settings in known.values() for one in settings),
     )
+
+
+def _comparable(known: Mapping[Path, Settings]) -> dict[Path, float]:
+    if len({tuple(one is None for one in settings) for settings in known.values()}) != 1:
+        return {}
+    return {path: light for path, one in known.items() if (light := one.light) is not None}
 
 
 def told_by_some(paths: Sequence[Path]) -> tuple[str, Path, Path] | None:

@@ -39,19 +39,21 @@ def versions_in(folder: Path) -> list[str]:
 
 def _is_version(folder: Path) -> bool:
     """Whether its manifest has the entries of ours, for those of other programs are called so too;
-    of one that is damaged its folder's name tells, of one that is lost the files beside."""
+    of one that is damaged the folder's name and its scan tell, of one that is lost the files."""
     manifest = folder / MANIFEST
     if not os.path.isfile(manifest):
         return _has_a_versions_files(folder)
     try:
         record = read_json(manifest)
     except InputRefused:
-        return VERSION.fullmatch(folder.name) is not None
+        return VERSION.fullmatch(folder.name) is not None and _has_a_scan(folder)
     return isinstance(record, dict) and {"schema", "check", "files"} <= record.keys()
 
 
 def _has_a_versions_files(folder: Path) -> bool:
     """Whether there is a root layer as publishing writes it, and none that an asset has."""
-    if not os.path.isfile(folder / "layers" / "scan.usdc"):
-        return False
-    return any(folder.glob("*.usd")) and not any(folder.glob("*.usda"))
+    return _has_a_scan(folder) and any(folder.glob("*.usd")) and not any(folder.glob("*.usda"))
+
+
+def _has_a_scan(folder: Path) -> bool:
+    return os.path.isfile(folder / "layers" / "scan.usdc")

@@ -48,15 +48,15 @@ def asked_of_its_pixels(
     agrees, astray = asked.agreement, frames_astray(asked.shown)
     warnings = warned(doubts_about_agreement(agrees, scan.source))
     metres = scan.meters_per_unit
-    warnings += warned(
+    misplaced = warned(
         doubts_about_registration(scan.mesh, rays, asked, astray, scan.source, metres)
     )
-    in_place = not warnings
-    if in_place and not options.refine_poses:
+    warnings += misplaced
+    if not warnings and not options.refine_poses:
         warnings += warned(doubts_about_steps(scan.mesh, rays, asked, astray, scan.source))
     estimate = options.vignetting == "estimate"
     scan, told, doubts = asked_of_its_optics(
-        scan, surface, rays, read, estimate=estimate, in_place=in_place
+        scan, surface, rays, read, estimate=estimate, in_place=not misplaced
     )
     warnings += warned(doubts)
     told |= {"agreement": agrees and agrees.ratio, "warnings": warnings}

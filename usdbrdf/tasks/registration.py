@@ -28,10 +28,11 @@ def doubts_about_registration(
     lens = lens_of_frames(mesh, rays, cameras, pictures)
     poses = similarity_of_frames(mesh, rays, cameras, pictures)
     if poses and poses.is_clear and (lens is None or poses.found.left < lens.left):
-        # Of poses that tremble some similarity fits best by chance, and they tremble after it.
+        # Of poses that tremble some similarity fits best by chance: it explains less than half of
+        # what a step of each does.
         moved = [poses.found.change.camera(camera) for camera in cameras]
-        left = own_steps_of_frames(mesh, rays, moved, pictures)
-        if left and left.is_clear:
+        steps = own_steps_of_frames(mesh, rays, moved, pictures)
+        if steps and steps.is_clear and 2 * (1 - poses.found.left) < 1 - steps.left:
             return
         yield said_of_similarity(poses, source, 1000 * metres)
     elif lens and lens.is_clear:
@@ -46,7 +47,8 @@ def doubts_about_steps(
     cameras, pictures = _of_others(asked, astray)
     found = own_steps_of_frames(mesh, rays, cameras, pictures)
     if found and found.is_clear:
-        yield said_of_own_steps(found, source, cameras[0].width)
+        widths = {camera.width for camera in cameras}
+        yield said_of_own_steps(found, source, widths.pop() if len(widths) == 1 else None)
 
 
 def _of_others(asked: Asked, astray: Bool) -> tuple[list[Camera], list[Float]]:

@@ -76,16 +76,17 @@ def _moved(rays: RayScene, before: Camera, after: Camera) -> float:
     return float(np.median(np.linalg.norm(apart, axis=1))) / before.width
 
 
-def said_of_own_steps(found: OwnSteps, source: Path, width: int) -> str:
+def said_of_own_steps(found: OwnSteps, source: Path, width: int | None) -> str:
     """A sentence on poses each of which is off by itself.
 
-    width  of the frames, in pixels
+    width  of the frames, in pixels; None where they differ
     """
+    pixels = f" ({found.usual * width:.1f} pixels)" if width else ""
     stepped = int((found.moved > 0).sum())
     return (
         f"{source.name}: {stepped} of {len(found.moved)} frames that were compared would agree "
         f"better with the others if each camera stood elsewhere, which moves what they show by "
-        f"{found.usual:.1%} of a picture's width ({found.usual * width:.1f} pixels) in the middle: "
+        f"{found.usual:.1%} of a picture's width{pixels} in the middle: "
         "their poses are off by as much at least, each by itself. --refine-poses lets each camera "
         "take such a step; beyond some pixels, align the photographs anew. [capture.steps]"
     )
