@@ -73,8 +73,8 @@ def exif_exposure(path: Path) -> float | None:
 def exif_focal_lengths(path: Path, width: int, height: int) -> list[float]:
     """Focal length, in pixels of the whole picture in that size, of a photograph whose EXIF data
     tell that of a camera for 35 mm film with as large an angle of view; of a digital zoom it may
-    tell that before it or after, and both are returned. None where they do not tell it, or the file
-    cannot be read, of which the reader of its pixels will tell."""
+    tell that before it or after, and both are returned. None are where they do not tell it, or the
+    file cannot be read, of which the reader of its pixels will tell."""
     with suppress(ImageRefused):
         said, zoom = map(_positive, header_of(path, [_FOCAL, _ZOOM]))
         if said is not None:
