@@ -329,11 +329,18 @@ def test_what_an_artist_changed_is_theirs_in_a_version_too(room, tmp_path):
         assert own_findings(Usd.Stage.Open(str(asset.root_layer))) == []
 
 
-def test_a_shot_of_other_programs_with_a_manifest_of_theirs_is_no_version(room, tmp_path):
+def test_a_shot_of_other_programs_with_a_manifest_of_theirs_is_no_version(tmp_path):
+    """Nor one with a damaged manifest that holds no scan."""
     shot = tmp_path / "v012"
-    shot.mkdir()
-    for text, ours in (('{"show": "x"}', False), ('{"files": {}, "schema"', True)):
+    (shot / "layers").mkdir(parents=True)
+    for text, scan, ours in (
+        ('{"show": "x"}', False, False),
+        ('{"files": {}, "schema"', False, False),
+        ('{"files": {}, "schema"', True, True),
+    ):
         (shot / "manifest.json").write_text(text)
+        if scan:
+            (shot / "layers/scan.usdc").touch()
         assert (version_around(shot / "study") == shot) is ours
 
 
