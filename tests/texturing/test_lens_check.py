@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.scenes import edited, make_capture
+from tests.texturing.study_frames import STUDY, study_frames
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.cli import main
 from usdbrdf.files.frames import read_frame
@@ -22,17 +23,12 @@ from usdbrdf.texturing.registration.joint_change import Found
 from usdbrdf.texturing.registration.lens import Pattern, lens_of_frames, said_of_lens
 from usdbrdf.transport.rays import RayScene
 
-STUDY = Path(__file__).parents[2] / "samples" / "study"
-
 
 @pytest.fixture(scope="module")
 def study():
     """Mesh, rays, cameras and pictures of some frames of the sample."""
-    scan = as_captured(read_scan(STUDY, IngestOptions()))
-    some = range(0, len(scan.frames), 5)
-    pictures = [logarithms(read_frame(scan.frames, i), 1) for i in some]
-    rays = RayScene(scan.mesh.points, scan.mesh.triangles)
-    return scan.mesh, rays, [scan.frames.camera(i) for i in some], pictures
+    mesh, cameras, pictures = study_frames(5)
+    return mesh, RayScene(mesh.points, mesh.triangles), cameras, pictures
 
 
 def _with_lens(study, longer=1.0, aside=0.0):

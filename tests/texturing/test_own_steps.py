@@ -11,15 +11,12 @@ import pytest
 
 import usdbrdf
 from tests.scenes import edited
-from usdbrdf.capture.adapters import read_scan
-from usdbrdf.files.frames import read_frame
+from tests.texturing.study_frames import STUDY, study_frames
 from usdbrdf.files.images import read_exr, write_exr
-from usdbrdf.model.upright import as_captured
 from usdbrdf.options import IngestOptions, InspectOptions
 from usdbrdf.tasks import registration
 from usdbrdf.tasks.agreement import Asked
 from usdbrdf.tasks.inspect import inspect
-from usdbrdf.texturing.pose_samples import logarithms
 from usdbrdf.texturing.registration.joint_change import Found
 from usdbrdf.texturing.registration.own_steps import (
     OwnSteps,
@@ -29,18 +26,14 @@ from usdbrdf.texturing.registration.own_steps import (
 from usdbrdf.texturing.registration.similarity import Similarity, SimilarityCheck
 from usdbrdf.transport.rays import RayScene
 
-STUDY = Path(__file__).parents[2] / "samples" / "study"
 SOURCE = Path("room/transforms.json")
 
 
 @pytest.fixture(scope="module")
 def study():
     """Mesh, cameras and pictures of some frames of the sample."""
-    scan = as_captured(read_scan(STUDY, IngestOptions()))
-    some = range(0, len(scan.frames), 4)
-    pictures = [logarithms(read_frame(scan.frames, i), 1) for i in some]
-    rays = RayScene(scan.mesh.points, scan.mesh.triangles)
-    return scan.mesh, rays, [scan.frames.camera(i) for i in some], pictures
+    mesh, cameras, pictures = study_frames(4)
+    return mesh, RayScene(mesh.points, mesh.triangles), cameras, pictures
 
 
 def _trembling(cameras, millimetres):

@@ -13,15 +13,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.scenes import camera_at
-from usdbrdf.capture.adapters import read_scan
+from tests.texturing.study_frames import STUDY, study_frames
 from usdbrdf.cli import main
-from usdbrdf.files.frames import read_frame
 from usdbrdf.files.ply import write_ply
-from usdbrdf.model.upright import as_captured
-from usdbrdf.options import IngestOptions
 from usdbrdf.tasks.agreement import Asked
 from usdbrdf.tasks.registration import doubts_about_registration
-from usdbrdf.texturing.pose_samples import logarithms
 from usdbrdf.texturing.registration.joint_change import Found, places_of
 from usdbrdf.texturing.registration.similarity import (
     Similarity,
@@ -32,7 +28,6 @@ from usdbrdf.texturing.registration.similarity import (
 from usdbrdf.transport.rays import RayScene
 from usdbrdf.untrusted.mesh_files import mesh_from_file
 
-STUDY = Path(__file__).parents[2] / "samples" / "study"
 SOURCE = Path("capture")
 OTHER = Similarity((0.5, -1.0, 2.0), 3.0, 0.1, (0.1, -0.2, 0.3), (0.05, 0.02, -0.04))
 
@@ -40,10 +35,7 @@ OTHER = Similarity((0.5, -1.0, 2.0), 3.0, 0.1, (0.1, -0.2, 0.3), (0.05, 0.02, -0
 @pytest.fixture(scope="module")
 def study():
     """Mesh, cameras and pictures of some frames of the sample."""
-    scan = as_captured(read_scan(STUDY, IngestOptions()))
-    some = range(0, len(scan.frames), 3)
-    pictures = [logarithms(read_frame(scan.frames, i), 1) for i in some]
-    return scan.mesh, [scan.frames.camera(i) for i in some], pictures
+    return study_frames(3)
 
 
 def _otherwise(mesh, scale=1.0, millimetres=(0, 0, 0), degrees=(0, 0, 0)):

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import median_low
 
 import numpy as np
 
@@ -132,7 +133,8 @@ def _exposures_told_otherwise(records: Sequence[FrameRecord], source: Path) -> I
         return
     known = np.array([lights[record.image_path] for record in told])
     ratio = np.log2(known) - np.log2([record.exposure_time for record in told])
-    off = np.abs(ratio - _middle(ratio.tolist()))
+    # One of them: what lies between two halves is nobody's.
+    off = np.abs(ratio - median_low(ratio.tolist()))
     if off.max() > _EXIF_STOPS:
         worst = int(off.argmax())
         yield (
@@ -158,7 +160,7 @@ def _lenses_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iter
             known.append((stated, told[int(off.argmin())]))
     if not known:
         return
-    times = _middle([stated / focal for stated, focal in known])
+    times = median_low([stated / focal for stated, focal in known])
     if max(times, 1 / times) > _EXIF_TIMES:
         stated, focal = min(known, key=lambda one: abs(one[0] / one[1] - times))
         yield (
@@ -167,11 +169,6 @@ def _lenses_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iter
             "that the intrinsics are those of these photographs, at their size, and that these "
             "were not cropped. [capture.lens]"
         )
-
-
-def _middle(values: Sequence[float]) -> float:
-    """One of them: what lies between two halves is nobody's."""
-    return sorted(values)[(len(values) - 1) // 2]
 
 
 def drop_cameras_inside(

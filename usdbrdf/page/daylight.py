@@ -15,7 +15,7 @@ from usdbrdf.model.material import turned_up
 from usdbrdf.options import ESTIMATE, Surroundings
 from usdbrdf.page.pictures import data_uri
 from usdbrdf.shading.asked import looked_around
-from usdbrdf.transport.environment import Environment, pixels_of_directions, solid_angles
+from usdbrdf.transport.environment import Environment, mean_radiance, pixels_of_directions
 from usdbrdf.transport.lit_scene import LitScene
 from usdbrdf.transport.sunlight import sunlight
 
@@ -71,10 +71,8 @@ def is_dark(environment: Environment, atlas: AssetMaps) -> bool:
     there."""
     if environment.sun.shines:
         return False
-    solid = solid_angles(*environment.image.shape[:2])
-    around = np.average(environment.image.mean(axis=(1, 2)), weights=solid)
     usual = float(np.median(atlas.irradiance)) if atlas.has("irradiance") else 0.0
-    return bool(np.pi * around <= _DARK * usual)
+    return bool(np.pi * mean_radiance(environment.image) <= _DARK * usual)
 
 
 def area_of(lit: LitScene) -> float:

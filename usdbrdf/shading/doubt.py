@@ -11,7 +11,7 @@ from usdbrdf.model.texels import Texels
 from usdbrdf.shading.clipped_light import ClippedLight
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.unseen_lamps import UnseenLamps
-from usdbrdf.transport.environment import solid_angles
+from usdbrdf.transport.environment import mean_radiance
 
 
 def doubt_of_outside(outside: Outside | None, lit: Float, measured: Bool) -> float:
@@ -22,9 +22,7 @@ def doubt_of_outside(outside: Outside | None, lit: Float, measured: Bool) -> flo
         return 0.0
     if outside.environment.sun.shines or not outside.is_estimated:
         return outside.doubt
-    image = outside.environment.image
-    rows = solid_angles(*image.shape[:2])
-    sky = float(rows @ image.mean(axis=(1, 2)) / rows.sum())
+    sky = mean_radiance(outside.environment.image)
     kept = float(np.median(lit[measured].mean(axis=1)))
     return outside.doubt * min(outside.open_share * sky / max(kept, 1e-30), 1.0)
 

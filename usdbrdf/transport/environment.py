@@ -102,6 +102,12 @@ def solid_angles(height: int, width: int) -> Double:
     return np.asarray((edges[:-1] - edges[1:]) * 2 * np.pi / width)
 
 
+def mean_radiance(image: Float) -> float:
+    """Of all directions and channels of a picture (H, W, 3) of them."""
+    rows = image.mean(axis=(1, 2))
+    return float(np.average(rows, weights=solid_angles(*image.shape[:2])))
+
+
 @kernel
 def environment_at(environment: Environment, x: float, y: float, z: float, channel: int) -> float:
     """Radiance from the unit direction (x, y, z); nearest pixel; for use inside kernels."""
