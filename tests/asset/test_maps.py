@@ -38,6 +38,16 @@ def test_every_map_is_decoded_once(tmp_path, monkeypatch: pytest.MonkeyPatch):
     assert {name.split(".")[1] for name in decoded} >= {"lit", "albedo", "samples"}
     assert set(decoded.values()) == {1}
 
+    # Views that differ by half of the radiance, of what enough of them show.
+    def half(path):
+        return 0.5 * read(path.with_name(path.name.replace(".spread.", ".lit.")))
+
+    monkeypatch.setattr(module, "read_exr", half)
+    often = maps.samples >= 3
+    told = [often[maps.texels.of_object(i)].any() for i in range(len(maps.scene.objects))]
+    assert any(told)
+    np.testing.assert_allclose(maps.differing, np.where(told, 0.5, 0), rtol=1e-3)
+
 
 def test_light_that_was_inferred_is_doubted_by_its_errors(tmp_path, monkeypatch):
     """Of a lamp, only where no frame measured it."""

@@ -74,6 +74,7 @@ def _evidence(
         position=position.astype(np.float32),
         segment=wall,
         object=wall,
+        doubt=np.ones(len(wall)),
         prior=np.array([LAMP_PRIOR] * len(lamps)),
         shines=np.ones(len(lamps), np.bool_),
     )
@@ -86,6 +87,38 @@ def test_exact_light_gives_the_exact_lamps():
     # One wall tells most of the first one; nothing but the stated error of such a lamp is left.
     assert found.standard_error.max() < ERROR_ALONE + 0.01
     assert found.standard_error.min() < 0.06
+
+
+def _with_mirror(evidence: Evidence, doubt: float) -> Evidence:
+    """And the metal body of the first lamp, which receives most of its light from it and shows what
+    it mirrors."""
+    rng, count = np.random.default_rng(7), 60
+    receives = np.exp(rng.normal(1, 1, (count, 1)))
+    added = {
+        "radiance": 0.3 * np.exp(rng.normal(0, 0.4, (count, 1))) * np.ones(3),
+        "irradiance": np.full((count, 3), 0.6),
+        "position": rng.uniform(1, 1.2, (count, 3)),
+        "segment": np.full(count, 6),
+        "object": np.full(count, 6),
+        "doubt": np.full(count, doubt),
+        "lamp_irradiance": np.stack([5 * receives, 0.02 * receives]) * np.ones(3),
+    }
+    both = {}
+    for name, values in added.items():
+        before = getattr(evidence, name)
+        axis = 1 if name == "lamp_irradiance" else 0
+        both[name] = np.concatenate([before, values], axis=axis).astype(before.dtype)
+    return replace(evidence, **both)
+
+
+def test_a_mirror_beside_a_lamp_outweighs_no_walls():
+    evidence = _evidence(noise=0.03)
+    found = estimate_clipped_emitters(_with_mirror(evidence, doubt=6))
+    assert found.determined.all()
+    np.testing.assert_allclose(found.multiplier, MULTIPLIER, rtol=0.05)
+    # Taken for a plain reflector it says that the lamp is as dark as may be.
+    plain = estimate_clipped_emitters(_with_mirror(evidence, doubt=1))
+    assert not plain.determined[0]
 
 
 @pytest.mark.parametrize(

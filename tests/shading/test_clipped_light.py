@@ -19,7 +19,12 @@ from usdbrdf.options import Sampling
 from usdbrdf.shading import clipped_light, lamp_light
 from usdbrdf.shading.clipped_emitters import UNTOLD, EstimatedRadiance, nothing_known
 from usdbrdf.shading.clipped_groups import ClippedGroups
-from usdbrdf.shading.clipped_light import ClippedLight, _with_estimates, estimate_clipped_light
+from usdbrdf.shading.clipped_light import (
+    ClippedLight,
+    _with_estimates,
+    doubt_by_views,
+    estimate_clipped_light,
+)
 from usdbrdf.shading.shaded import shade_surface
 from usdbrdf.transport.environment import Environment, Sun, black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels
@@ -425,3 +430,10 @@ def test_a_lamp_that_only_the_first_round_tells_stays_as_that_tells_it(
     lamp = light.groups.lamp
     assert light.estimate.determined[lamp].all()
     np.testing.assert_array_equal(light.estimate.multiplier[lamp], rounds[1][0].multiplier[lamp])
+
+
+def test_what_looks_another_way_from_each_side_is_doubted():
+    owner = np.array([0, 0, 0, 1, 2], np.int32)
+    differing = np.array([0.05, 0.4, 0.0])
+    np.testing.assert_allclose(doubt_by_views(differing, owner), [1, 1, 1, 8, 1])
+    assert (doubt_by_views(None, owner) == 1).all()

@@ -31,7 +31,7 @@ from usdbrdf.files.colour import DATA, WORKING_SPACE, display_exposure, to_displ
 from usdbrdf.files.images import image_size, needs_float, read_exr, write_exr, write_preview_png
 from usdbrdf.geometry.texels import texels_from_atlas
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.scene import Scene, SceneObject
 from usdbrdf.model.texels import CoverageMap, Texels
@@ -52,6 +52,8 @@ _AT_A_TIME = min(4, os.cpu_count() or 1)
 _MAX_WIDTH = 640
 # The camera is chosen among this many frames, by about this many rays through each.
 _CANDIDATES, _RAYS = 64, 2000
+# A texel's views are told to differ by no fewer frames.
+_FRAMES_THAT_DIFFER = 3
 # Relative errors: of light of which only a bound is known, and of what surfaces send out that no
 # frame shows.
 _OF_BOUND, _OF_HIDDEN = 1.0, calibration.number("hidden.error")
@@ -204,6 +206,20 @@ class AssetMaps:
     def samples(self) -> Float:
         """(T,): how many frames measured each texel."""
         return self.map("samples")[:, 0]
+
+    @cached_property
+    def differing(self) -> Double:
+        """(num_objects,): how far the radiances differ that frames show of one texel, their
+        interquartile range next to L_d, in the middle of an object's texels of which it can be
+        told; 0 where there are none."""
+        found = np.zeros(len(self.scene.objects))
+        for i, obj in enumerate(self.scene.objects):
+            lit, own = self.lit[self.texels.of_object(i)].mean(axis=1), self.texels.of_object(i)
+            told = (self.samples[own] >= _FRAMES_THAT_DIFFER) & (lit > 0)
+            if told.any():
+                spread = self.texels.from_image(i, read_exr(self._file(obj, "spread")))
+                found[i] = np.median(spread.mean(axis=1)[told] / lit[told])
+        return found
 
     @property
     def irradiance(self) -> Float:

@@ -123,6 +123,8 @@ class Evidence:
     position        (N, 3) float32, in lamps.errors.unit
     segment         (N,) int32, equal where the albedo may be taken as alike
     object          (N,) int32, equal where errors may agree beyond the segment
+    doubt           (N,) float64, how many times as badly as usual the texel tells what a plain
+                    reflector would show, at least 1; equal in a segment
     prior           (K, 2) float64, mean and standard deviation of log g_k before the evidence
     shines          (K,) bool: it is a lamp for certain, and no surface that is lit brightly
     """
@@ -133,6 +135,7 @@ class Evidence:
     position: Float
     segment: Int
     object: Int
+    doubt: Double
     prior: Double
     shines: Bool
 
@@ -141,8 +144,8 @@ class Evidence:
 class Segment:
     """Texels of one segment: log of pi L_d without ambient specular light (n, 3), its change by
     what that light may be wrong (n,), distances (n, n) in lamps.errors.unit, variance
-    relative to the common noise of the texels (n,) and of the whole segment (scale), and what its
-    own specular light may differ by (specular, relative)."""
+    relative to the common noise of the texels (n,) and of the whole segment (scale, at least
+    least_scale), and what its own specular light may differ by (specular, relative)."""
 
     index: npt.NDArray[np.int64]
     object: int
@@ -150,6 +153,7 @@ class Segment:
     ambient: Double
     distance: Double
     variance: Double
+    least_scale: float
     scale: float
     specular: float
 
@@ -170,6 +174,7 @@ def segments_of(evidence: Evidence) -> list[Segment]:
             np.log(whole - np.minimum(share * evidence.irradiance[index], _MOSTLY_AMBIENT * whole))
             for share in (_AMBIENT, _AMBIENT + _AMBIENT_ERROR)
         )
+        least_scale = float(evidence.doubt[index[0]]) ** 2
         segments.append(
             Segment(
                 index=index,
@@ -178,7 +183,8 @@ def segments_of(evidence: Evidence) -> list[Segment]:
                 ambient=(more - observed).mean(axis=1),
                 distance=np.linalg.norm(position[:, None] - position, axis=-1),
                 variance=np.ones(len(index)),
-                scale=1.0,
+                least_scale=least_scale,
+                scale=least_scale,
                 specular=0.0,
             )
         )
@@ -355,7 +361,7 @@ def _judged(evidence: Evidence, item: Segment, weight: Double, log_g: Double) ->
     variance = (freedom + error * item.scale) / (freedom + 1)
     misfit = item.scale * float(residual @ weight @ residual)
     count = len(item.index) - 1
-    scale = max(1.0, (freedom + misfit) / (freedom + count))
+    scale = max(item.least_scale, (freedom + misfit) / (freedom + count))
     specular = AMBIENT_SPREAD / min(max(albedo, 0.01), 1)
     return replace(item, variance=np.maximum(variance, 1.0), scale=scale, specular=specular)
 

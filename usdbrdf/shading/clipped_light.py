@@ -127,10 +127,12 @@ def estimate_clipped_light(
     seed: int,
     said: Mapping[int, bool] = MappingProxyType({}),
     unseen: Bool | None = None,
+    differing: Double | None = None,
 ) -> ClippedLight:
     """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
     said: of objects whether they are lamps, where that is known. unseen (T,): the texels of lamps
-    that no frame shows, whose radiance is in ``lit``; None without any."""
+    that no frame shows, whose radiance is in ``lit``; None without any. differing (num_objects,):
+    how far views of one texel differ, relative to it; None where that is not known."""
     spots = hardly_shown(surface.texels, coverage, said)
     if len(spots):
         given = surface, coverage, frames, spots, seed
@@ -141,7 +143,7 @@ def estimate_clipped_light(
     say(f"shade: {len(groups)} parts clip in every frame; their light is weighed")
 
     def compute() -> dict[str, Array]:
-        given = surface, lit, coverage, frames, environment, groups, said, unseen, seed
+        given = surface, lit, coverage, frames, environment, groups, said, unseen, differing, seed
         told, wall = _Weighing(*given).told()
         return {**vars(told), "wall": wall}
 
@@ -185,6 +187,7 @@ class _Weighing:
     groups: ClippedGroups
     said: Mapping[int, bool]
     unseen: Bool | None
+    differing: Double | None
     seed: int
 
     @cached_property
@@ -245,6 +248,7 @@ class _Weighing:
         shining = Shining.of(self.surface, rest, self.environment)
         # Of some groups no texel may be left.
         left = np.isin(np.arange(len(groups)), groups.group)
+        owner = texels.object_index()[chosen]
         return Evidence(
             radiance=light[chosen],
             irradiance=irradiance_of_texels(
@@ -253,7 +257,8 @@ class _Weighing:
             lamp_irradiance=np.where(left[:, None, None], self._of_each, np.float32(0)),
             position=texels.position[chosen] / (_UNIT * np.sqrt(texels.area.sum())),
             segment=segment,
-            object=texels.object_index()[chosen].astype(np.int32),
+            object=owner.astype(np.int32),
+            doubt=doubt_by_views(self.differing, owner),
             prior=groups.priors(),
             shines=groups.lamp,
         )
@@ -295,6 +300,16 @@ class _Weighing:
         received = irradiance_of_texels(self.surface, shining, outside, chosen, self.seed)
         reflected = np.pi * self.lit[chosen].mean()
         return bool(received.mean() > _LEAST_OF_LIGHT * reflected)
+
+
+def doubt_by_views(differing: Double | None, owner: Int) -> Double:
+    """(N,): how many times as far as is usual among texels of objects ``owner`` (N,) the views of
+    their objects differ, at least 1. What looks another way from each side mirrors: the middle of
+    that is what a plain reflector shows by chance alone."""
+    if differing is None:
+        return np.ones(len(owner))
+    of_texel = differing[owner]
+    return np.maximum(of_texel / max(float(np.median(of_texel)), 1e-30), 1)
 
 
 def reflects_other_light(

@@ -17,7 +17,7 @@ from scipy import ndimage
 from usdbrdf import calibration
 from usdbrdf.job.progress import say
 from usdbrdf.job.task import TaskRun
-from usdbrdf.model.arrays import Array, Bool, Float, Int, Long
+from usdbrdf.model.arrays import Array, Bool, Double, Float, Int, Long
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.texels import CoverageMap, Texels
 from usdbrdf.options import BEFORE_FILTER, Sampling
@@ -360,6 +360,7 @@ def _light(
     outside: Outside | None,
     seed: int,
     said: Mapping[int, bool],
+    differing: Double | None,
 ) -> tuple[ClippedLight, UnseenLamps]:
     """L_d with what hidden surfaces send on, and with the lamps that no frame measures."""
     environment = outside.environment if outside else black_environment()
@@ -378,7 +379,7 @@ def _light(
     of_unseen = np.isin(owner, unseen.object)
     light = estimate_clipped_light(
         run, surface, lit, coverage, frames, environment, seed, said,
-        of_unseen if of_unseen.any() else None,
+        of_unseen if of_unseen.any() else None, differing,
     )  # fmt: skip
     lamps = light.groups.texels_of(light.groups.lamp) | of_unseen
     if (light.lit[lamps] == filled[lamps]).all() and not (may_shine & ~told & ~lamps).any():
@@ -429,6 +430,7 @@ def shade_surface(
     sampling: Sampling,
     lightmap_filter: str,
     said: Mapping[int, bool] = MappingProxyType({}),
+    differing: Double | None = None,
 ) -> Shaded:
     """Trace S with the light ``lit`` (T, 3), L_d as texturing left it; divide; find the emitters.
 
@@ -436,12 +438,13 @@ def shade_surface(
     frames   which views L_d is from
     outside  the light from outside; None for none
     said     of objects, by number, whether they are lamps, where a person says so
+    differing  of objects, how far the views of one texel differ, relative to it
     """
     environment = outside.environment if outside else black_environment()
     # What panes show is sent by what is behind them: they are no lamps, whatever their radiance.
     said, panes = {**said, **dict.fromkeys(surface.panes, False)}, surface.of_panes()
     sent = *beside_panes(surface, lit, coverage), frames, outside, sampling.seed, said
-    light, unseen = _light(run, surface, *sent)
+    light, unseen = _light(run, surface, *sent, differing)
     filtered = lightmap_filter == OIDN
     if filtered:
         sampling = replace(sampling, standard_error=BEFORE_FILTER * sampling.standard_error)

@@ -34,8 +34,8 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
     maps = AssetMaps(open_weaker(asset, "shading"))
     asked = directives_of(asset, maps.stage, OF_SHADE)
     inputs = hashes_of_inputs(
-        asset, "shading", maps, aovs=("lit", "coverage"), environment=options.environment,
-        photographs=options.environment != NO_LIGHT,
+        asset, "shading", maps, aovs=("lit", "coverage", "samples", "spread"),
+        environment=options.environment, photographs=options.environment != NO_LIGHT,
     )  # fmt: skip
     parameters = {
         **asdict(options.sampling),
@@ -51,7 +51,7 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
         outside = outside_of(run, maps, surface, options, task.header.up_axis, said)
         # Where nothing is outside, what panes show is all that is known of the light behind them.
         given = surface if outside else maps.surface, maps.lit, maps.coverage, maps.frames, outside
-        shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said)
+        shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said, maps.differing)
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
         objects = [
