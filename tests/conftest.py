@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 import usdbrdf.job.child
 from tests.children import Children
 from tests.synthetic_asset import box, build, make_scan
+from usdbrdf.job.processes import granted_cores
 from usdbrdf.job.progress import set_quiet
 
 # Files and folders whose tests run the pipeline, kill processes, start other programs, damage whole
@@ -132,6 +133,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
     tests = Counter(item.path for item in items)
     items.sort(key=lambda item: ("slow" not in item.keywords, -tests[item.path], item.path))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than cores: a quarter of the time tests wait, for processes, sockets and disks."""
+    return granted_cores() + 1
 
 
 @pytest.fixture(autouse=True, scope="session")
