@@ -8,14 +8,17 @@ from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
+import numba
 import pytest
 from threadpoolctl import threadpool_limits
 
 import usdbrdf.job.child
 from tests.children import Children
+from tests.remembered import remembered
 from tests.synthetic_asset import box, build, make_scan
 from usdbrdf.job.processes import granted_cores
 from usdbrdf.job.progress import set_quiet
+from usdbrdf.tasks import registration
 
 # Files and folders whose tests run the pipeline, kill processes, start other programs, damage whole
 # captures, pack whole assets or fit materials; `pytest -m "not slow"` leaves them out.
@@ -142,9 +145,20 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _one_thread_of_blas():
-    """As in the work of a task: the tests' processes share the cores already."""
-    with threadpool_limits(limits=1, user_api="blas"):
+def _one_thread():
+    """Of BLAS, as in the work of a task, and of the kernels, but where a test is about their
+    threads: the tests' processes share the cores already."""
+    with threadpool_limits(limits=1, user_api="blas"), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _registration_remembered():
+    """As it is asked by ``ingest``; the tests about it ask it themselves."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("lens_of_frames", "similarity_of_frames", "own_steps_of_frames"):
+            patch.setattr(registration, name, remembered(getattr(registration, name)))
         yield
 
 
