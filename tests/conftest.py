@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numba
 import pytest
@@ -117,6 +118,9 @@ NIGHTLY = (
 # Tests of how children start, what they import and what they may open: they start fresh.
 FRESH = ("faults/test_what_children_open.py", "job/test_child.py")
 
+# Folders whose files share an asset that takes seconds to make: one process runs them all.
+TOGETHER = ("evaluation", "nondestruction", "page")
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what is slow, and what is for the night; slow files first, of each kind those with the
@@ -142,6 +146,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_xdist_auto_num_workers() -> int:
     """One more than cores: a quarter of the time tests wait, for processes, sockets and disks."""
     return granted_cores() + 1
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """As ``--dist loadfile``, but for what stays ``TOGETHER``."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class OfFilesAndFolders(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = str(super()._split_scope(nodeid))
+            folder = file.rpartition("/")[0]
+            return folder if folder in {f"tests/{name}" for name in TOGETHER} else file
+
+    return OfFilesAndFolders(config, log)
 
 
 @pytest.fixture(autouse=True, scope="session")
