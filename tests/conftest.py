@@ -7,14 +7,19 @@ import sys
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numba
 import pytest
 from threadpoolctl import threadpool_limits
 
 import usdbrdf.job.child
 from tests.children import Children
+from tests.remembered import remembered
 from tests.synthetic_asset import box, build, make_scan
+from usdbrdf.job.processes import granted_cores
 from usdbrdf.job.progress import set_quiet
+from usdbrdf.tasks import registration
 
 # Files and folders whose tests run the pipeline, kill processes, start other programs, damage whole
 # captures, pack whole assets or fit materials; `pytest -m "not slow"` leaves them out.
@@ -113,6 +118,9 @@ NIGHTLY = (
 # Tests of how children start, what they import and what they may open: they start fresh.
 FRESH = ("faults/test_what_children_open.py", "job/test_child.py")
 
+# Folders whose files share an asset that takes seconds to make: one process runs them all.
+TOGETHER = ("evaluation", "nondestruction", "page")
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what is slow, and what is for the night; slow files first, of each kind those with the
@@ -134,10 +142,41 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: ("slow" not in item.keywords, -tests[item.path], item.path))
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than cores: a quarter of the time tests wait, for processes, sockets and disks."""
+    return granted_cores() + 1
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """As ``--dist loadfile``, but for what stays ``TOGETHER``."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class OfFilesAndFolders(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = str(super()._split_scope(nodeid))
+            folder = file.rpartition("/")[0]
+            return folder if folder in {f"tests/{name}" for name in TOGETHER} else file
+
+    return OfFilesAndFolders(config, log)
+
+
 @pytest.fixture(autouse=True, scope="session")
-def _one_thread_of_blas():
-    """As in the work of a task: the tests' processes share the cores already."""
-    with threadpool_limits(limits=1, user_api="blas"):
+def _one_thread():
+    """Of BLAS, as in the work of a task, and of the kernels, but where a test is about their
+    threads: the tests' processes share the cores already."""
+    with threadpool_limits(limits=1, user_api="blas"), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _registration_remembered():
+    """As it is asked by ``ingest``; the tests about it ask it themselves."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("lens_of_frames", "similarity_of_frames", "own_steps_of_frames"):
+            patch.setattr(registration, name, remembered(getattr(registration, name)))
         yield
 
 

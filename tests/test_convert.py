@@ -33,6 +33,7 @@ from usdbrdf.files.colour import to_display_srgb8
 from usdbrdf.files.images import read_exr, write_exr, write_preview_png
 from usdbrdf.job.progress import set_quiet
 from usdbrdf.job.stamp import hash_of_files
+from usdbrdf.kernel import num_threads
 
 OPTIONS = usdbrdf.ConvertOptions(
     texture=usdbrdf.TextureOptions(texel_size=0.2),
@@ -258,13 +259,16 @@ def test_a_capture_in_other_units_does_not_fit_the_root(capture, copy):
 
 @pytest.mark.fault("R13")
 def test_the_number_of_threads_changes_nothing(base, capture, asset):
-    single = base / "single" / "room"
+    threads = 3
+    assert num_threads() != threads
+    others = base / "others" / "room"
+    environment = {"PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_NUM_THREADS": str(threads)}
     done = subprocess.run(
-        [sys.executable, "-m", "usdbrdf", "convert", capture.folder, "-o", single, *COARSE],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_NUM_THREADS": "1"},
+        [sys.executable, "-m", "usdbrdf", "convert", capture.folder, "-o", others, *COARSE],
+        env={**os.environ, **environment},
     )
     assert done.returncode == 0
-    one, many = (contents(folder, "textures", "layers") for folder in (single, asset.folder))
+    one, many = (contents(folder, "textures", "layers") for folder in (asset.folder, others))
     assert one == many
 
 

@@ -18,6 +18,7 @@ from usdbrdf.asset.layout import Asset
 from usdbrdf.asset.readers.compose import open_weaker
 from usdbrdf.asset.readers.scene import frames_from_stage
 from usdbrdf.capture.adapters import read_scan
+from usdbrdf.cli import main
 from usdbrdf.errors import InputRefused
 from usdbrdf.options import IngestOptions
 
@@ -48,10 +49,10 @@ def installed(plugins, tmp_path_factory):
 def usdbrdf(installed, tmp_path):
     """The command line with the package installed."""
 
-    def run(*arguments, site=installed):
+    def run(*arguments):
         return subprocess.run(
             [sys.executable, "-m", "usdbrdf", *map(str, arguments)],
-            env={**os.environ, "PYTHONPATH": str(site)},
+            env={**os.environ, "PYTHONPATH": str(installed)},
             cwd=tmp_path,
             capture_output=True,
             text=True,
@@ -109,14 +110,14 @@ def test_the_cameras_are_the_true_ones(usdbrdf, capture, tmp_path):
     assert sorted(meshes) == sorted(capture.names)
 
 
-def test_an_upgraded_adapter_reads_again(usdbrdf, installed, capture, tmp_path):
+def test_an_upgraded_adapter_reads_again(installed, capture, tmp_path, monkeypatch, capsys):
     site = tmp_path / "site"
     shutil.copytree(installed, site)
+    monkeypatch.syspath_prepend(site)
 
     def said():
-        done = usdbrdf("ingest", capture.folder, "-o", tmp_path / "asset", site=site)
-        assert done.returncode == 0, done.stderr
-        return done.stderr.splitlines()[-1]
+        assert main(["ingest", str(capture.folder), "-o", str(tmp_path / "asset")]) == 0
+        return capsys.readouterr().err.splitlines()[-1]
 
     assert said().endswith(": written")
     assert said().endswith(": up to date")

@@ -195,16 +195,18 @@ def best_change(
     if len(cameras) < _MIN_FRAMES or narrowest < _LEAST_SIDE:
         return None
     frames = _Frames(rays, cameras, pictures, surface)
-    begun = [frames.shown(0, start) for start in starts]
-    most = max(len(samples.point) for samples in begun)
+    shown = {start: frames.shown(0, start) for start in starts}
+    most = max(len(samples.point) for samples in shown.values())
     # One under which few points are seen at all is no better one.
-    sound = [i for i, samples in enumerate(begun) if 2 * len(samples.point) >= most]
-    found = starts[min(sound, key=lambda i: _disagreement(begun[i]))]
+    sound = [start for start in starts if 2 * len(shown[start].point) >= most]
+    found = min(sound, key=lambda one: _disagreement(shown[one]))
     for size in range(len(frames.sizes)):
+        if size:
+            shown = {one: frames.shown(size, one) for one in {starts[0], found}}
         # What was found in smaller pictures may be what these alone do not tell apart.
-        found = min(starts[0], found, key=lambda one: _disagreement(frames.shown(size, one)))
+        found = min(starts[0], found, key=lambda one: _disagreement(shown[one]))
         for _ in range(_STEPS):
-            samples = frames.shown(size, found)
+            samples = shown.get(found) or frames.shown(size, found)
             if len(samples.point) < _FEWEST:
                 return None
             step, covariance = _step(samples)
@@ -213,7 +215,7 @@ def best_change(
                 return None
             if np.abs(step).max() < _ENOUGH:
                 break
-    told, best = (frames.shown(len(frames.sizes) - 1, change) for change in (starts[0], found))
+    told, best = shown[starts[0]], frames.shown(len(frames.sizes) - 1, found)
     if min(len(told.point), len(best.point)) < _FEWEST:
         return None
     better, compared = _better(told, best, len(cameras))
