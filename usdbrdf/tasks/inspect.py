@@ -63,10 +63,12 @@ def inspect(
             astray = frames_astray(asked.shown)
             metres = found.meters_per_unit or 1.0
             doubts += doubts_about_registration(mesh, rays, asked, astray, capture, metres)
-            if not doubts:
+            misplaced = bool(doubts)
+            if not misplaced:
                 doubts += doubts_about_steps(mesh, rays, asked, astray, capture)
             shown = np.where(astray, np.nan, asked.shown)
-            unlike = contradiction_of_frames(shown, surface.point, frames)
+            # Of frames that do not stand where they say it seems so by that alone.
+            unlike = None if misplaced else contradiction_of_frames(shown, surface.point, frames)
             if not is_curve(unlike):
                 doubts += doubts_about_places(astray, names, capture)
             doubts += doubts_about_response(unlike, frames, capture)

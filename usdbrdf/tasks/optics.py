@@ -44,20 +44,21 @@ def asked_of_its_optics(
     that corners are darker by, and that the balance of red or blue to green is off by in the worst
     frame; and a sentence for the user on each of them that is much, on frames astray, and on those
     that are brighter or darker than others, which is left to ``exposures_estimated`` where that
-    cures it. Where frames are known not to be ``in_place``, or to have another transfer curve,
-    their balance seems to drift by that alone, and nothing is said of it."""
+    cures it. Where frames are known not to be ``in_place``, brightness and balance seem to differ
+    by that alone, and balance where they have another transfer curve: nothing is said of it."""
     frames = scan.frames
     most = _MOST_PIXELS // max(1, int(frames.resolution.prod(axis=1, dtype=np.int64).max()))
     asked = spread_evenly(len(frames), min(max(most, _FEWEST_ASKED), _MOST_ASKED))
     images = read_frames(read, asked)
-    shown = progress(images, total=len(asked), label="optics", unit="frames")
-    columns = [samples_in_frame(surface, rays, frames.camera(i), pixels) for i, pixels in shown]
+    read_so = progress(images, total=len(asked), label="optics", unit="frames")
+    columns = [samples_in_frame(surface, rays, frames.camera(i), pixels) for i, pixels in read_so]
     logarithm, radius2 = (np.stack(each, axis=1) for each in zip(*columns, strict=True))
     astray = frames_astray(logarithm.mean(axis=2))
     names = [frames.image_paths[i].name for i in asked]
     logarithm[:, astray] = np.nan  # of whose lens and colours nothing is known
     compared = frames.at(asked)
-    unlike = contradiction_of_frames(logarithm.mean(axis=2), surface.point, compared)
+    shown = logarithm.mean(axis=2)
+    unlike = contradiction_of_frames(shown, surface.point, compared) if in_place else None
     # Under another curve frames that share little seem to show other things.
     doubts = [] if is_curve(unlike) else [*doubts_about_places(astray, names, scan.source)]
     doubts += doubts_about_response(unlike, compared, scan.source, estimated=exposures_estimated)

@@ -199,7 +199,9 @@ def doubts_about_agreement(found: Agreement | None, shown: Float, source: Path) 
     """
     if found is None or not is_doubtful(found):
         return
-    if is_doubtful(agreement(shown - gains_of_frames(shown).logarithm.astype(np.float32))):
+    alike = agreement(shown - gains_of_frames(shown).logarithm.astype(np.float32))
+    # Gains take some of what wrong poses do, but never most of it.
+    if alike is None or 2 * alike.ratio > found.ratio:
         yield (
             f"{source.name}: frames that show the same points of the mesh differ by "
             f"{found.ratio:.0%} of what any two pixels do, under every usual reading of the poses. "
