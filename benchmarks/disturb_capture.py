@@ -3,7 +3,8 @@
     python benchmarks/disturb_capture.py CAPTURE OUTPUT [--pose-degrees D] [--pose-mm M]
         [--exposure-drift S] [--clip RADIANCE] [--seed N] [--focal F] [--principal SHARE]
         [--shift-poses N] [--keep-every N] [--tenth-stops STOPS] [--auto-exposure]
-        [--balance-drift STOPS] [--vignetting STOPS] [--distortion K1] [--encode srgb|linear]
+        [--exposure-ramp STOPS] [--balance-drift STOPS] [--vignetting STOPS] [--distortion K1]
+        [--encode srgb|linear]
         [--mesh-scale F] [--mesh-mm X Y Z] [--mesh-degrees X Y Z] [--move-object NAME MM]
 
 CAPTURE is a folder with transforms.json, as `samples/study`. Disturbed are, frame by frame:
@@ -12,7 +13,8 @@ CAPTURE is a folder with transforms.json, as `samples/study`. Disturbed are, fra
               each by Gaussian distances of M mm; each frame at the pose of that N before it
     exposure  radiance times exp(N(0, S)), as a wrong exposure time would have it: the frame's
               saturation and noise floor are wrong by the same factor; or one frame in ten times
-              2^STOPS; or each divided by the middle of what it shows
+              2^STOPS; or brighter by STOPS in all from the first to the last; or each divided by
+              the middle of what it shows
     clipping  radiance cut at --clip, which becomes the saturation of frames that went further
     colour    red times 2^(STOPS / 2) and blue as much less in the last frame, from the other way in
               the first; corners 2^-STOPS, by rho^2
@@ -66,6 +68,7 @@ def main() -> int:
     parser.add_argument("--shift-poses", type=int, default=0, metavar="N")
     parser.add_argument("--keep-every", type=int, default=1, metavar="N")
     parser.add_argument("--tenth-stops", type=float, default=0.0, metavar="STOPS")
+    parser.add_argument("--exposure-ramp", type=float, default=0.0, metavar="STOPS")
     parser.add_argument("--auto-exposure", action="store_true")
     parser.add_argument("--balance-drift", type=float, default=0.0, metavar="STOPS")
     parser.add_argument("--vignetting", type=float, default=0.0, metavar="STOPS")
@@ -89,6 +92,7 @@ def main() -> int:
     rng = np.random.default_rng([options.seed, EXPOSURES])
     gains = np.exp(options.exposure_drift * rng.standard_normal(len(frames)))
     gains[::10] *= 2**options.tenth_stops
+    gains *= 2 ** (options.exposure_ramp * np.linspace(-0.5, 0.5, len(frames)))
     copy_unchanged(options.capture, options.output, images | {mesh_name(document)})
     disturb_mesh(options, document)
     for i, (frame, gain) in enumerate(zip(frames, gains, strict=True)):

@@ -158,7 +158,7 @@ def test_colours_of_frames_that_show_other_places_are_not_said_to_drift(tmp_path
 
 
 def test_exposures_that_are_wrong_hide_no_drift_of_colours(tmp_path):
-    """Poses are where they are, though frames hardly agree."""
+    """Poses are where they are, and nobody says that they are not."""
     capture = _capture(tmp_path / "scan", lambda document: None)
     rng = np.random.default_rng(1)
     frames = sorted((capture / "frames").iterdir())[::4]
@@ -167,4 +167,4 @@ def test_exposures_that_are_wrong_hide_no_drift_of_colours(tmp_path):
         write_exr(file, read_exr(file) * np.exp(rng.normal(0, 0.9)) * [tint, 1, 1 / tint])
     with usdbrdf.working_on(tmp_path / "asset") as asset:
         found = usdbrdf.ingest(capture, asset, IngestOptions()).summary
-    assert _codes(found["warnings"]) == ["[capture.agreement]", "[capture.balance]"]
+    assert _codes(found["warnings"]) == ["[capture.exposure]", "[capture.balance]"]

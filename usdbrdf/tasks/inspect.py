@@ -7,6 +7,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from usdbrdf.capture.checks import spread_evenly
 from usdbrdf.capture.develop import developed_in
 from usdbrdf.capture.inspection import Inspection
@@ -23,6 +25,7 @@ from usdbrdf.tasks.registration import doubts_about_registration, doubts_about_s
 from usdbrdf.tasks.turned import frames_to_compare, refuse_turned
 from usdbrdf.texturing.agreement import doubts_about_agreement, surface_and_rays
 from usdbrdf.texturing.astray import doubts_about_places, frames_astray
+from usdbrdf.texturing.response import contradiction_of_frames, doubts_about_response, is_curve
 
 
 def inspect(
@@ -56,13 +59,19 @@ def inspect(
             of_all = every.world_from_camera, numbers
             asked = agreement_of_frames(surface, rays, frames, read, capture, of_all)
             names = [path.name for path in frames.image_paths]
-            doubts = [*doubts_about_agreement(asked.agreement, capture)]
+            doubts = [*doubts_about_agreement(asked.agreement, asked.shown, capture)]
             astray = frames_astray(asked.shown)
             metres = found.meters_per_unit or 1.0
             doubts += doubts_about_registration(mesh, rays, asked, astray, capture, metres)
-            if not doubts:
+            misplaced = bool(doubts)
+            if not misplaced:
                 doubts += doubts_about_steps(mesh, rays, asked, astray, capture)
-            doubts += doubts_about_places(astray, names, capture)
+            shown = np.where(astray, np.nan, asked.shown)
+            # Of frames that do not stand where they say it seems so by that alone.
+            unlike = None if misplaced else contradiction_of_frames(shown, surface.point, frames)
+            if not is_curve(unlike):
+                doubts += doubts_about_places(astray, names, capture)
+            doubts += doubts_about_response(unlike, frames, capture)
             objects = found.objects
             if options.objects == AUTO:
                 frames = developed_frames(frames_that_tell_colours(mesh, len(every)), folder)

@@ -1,5 +1,5 @@
-"""Frames that stand elsewhere than they say, vignetting and drift of the white balance: told, and
-vignetting divided out on demand."""
+"""Frames that stand elsewhere than they say, that contradict each other about how bright things
+are, vignetting and drift of the white balance: told, and vignetting divided out on demand."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ from usdbrdf.texturing.optics import (
     falloff_of_frames,
     samples_in_frame,
 )
+from usdbrdf.texturing.response import contradiction_of_frames, doubts_about_response, is_curve
 from usdbrdf.transport.rays import RayScene
 
-# Frames that are asked, and how many are named.
-_ASKED, _LISTED = 32, 6
+# Frames that are asked, at least and at most, and pixels of all beyond the least, which take
+# seconds to read; and how many frames are named.
+_FEWEST_ASKED, _MOST_ASKED, _MOST_PIXELS, _LISTED = 32, 128, 1 << 25, 6
 
 
 def asked_of_its_optics(
@@ -35,23 +37,31 @@ def asked_of_its_optics(
     read: Read,
     *,
     estimate: bool,
+    exposures_estimated: bool = False,
     in_place: bool = True,
 ) -> tuple[Scan, dict[str, Any], list[str]]:
     """The scan, its frames' vignetting to be divided out if ``estimate``; what was found: stops
     that corners are darker by, and that the balance of red or blue to green is off by in the worst
-    frame; and a sentence for the user on each of them that is much, and on frames astray. Where
-    frames are known not to be ``in_place``, their balance seems to drift by that alone, and nothing
-    is said of it."""
+    frame; and a sentence for the user on each of them that is much, on frames astray, and on those
+    that are brighter or darker than others, which is left to ``exposures_estimated`` where that
+    cures it. Where frames are known not to be ``in_place``, brightness and balance seem to differ
+    by that alone, and balance where they have another transfer curve: nothing is said of it."""
     frames = scan.frames
-    asked = spread_evenly(len(frames), _ASKED)
+    most = _MOST_PIXELS // max(1, int(frames.resolution.prod(axis=1, dtype=np.int64).max()))
+    asked = spread_evenly(len(frames), min(max(most, _FEWEST_ASKED), _MOST_ASKED))
     images = read_frames(read, asked)
-    shown = progress(images, total=len(asked), label="optics", unit="frames")
-    columns = [samples_in_frame(surface, rays, frames.camera(i), pixels) for i, pixels in shown]
+    read_so = progress(images, total=len(asked), label="optics", unit="frames")
+    columns = [samples_in_frame(surface, rays, frames.camera(i), pixels) for i, pixels in read_so]
     logarithm, radius2 = (np.stack(each, axis=1) for each in zip(*columns, strict=True))
     astray = frames_astray(logarithm.mean(axis=2))
     names = [frames.image_paths[i].name for i in asked]
-    doubts = list(doubts_about_places(astray, names, scan.source))
     logarithm[:, astray] = np.nan  # of whose lens and colours nothing is known
+    compared = frames.at(asked)
+    shown = logarithm.mean(axis=2)
+    unlike = contradiction_of_frames(shown, surface.point, compared) if in_place else None
+    # Under another curve frames that share little seem to show other things.
+    doubts = [] if is_curve(unlike) else [*doubts_about_places(astray, names, scan.source)]
+    doubts += doubts_about_response(unlike, compared, scan.source, estimated=exposures_estimated)
     samples = Samples(logarithm, radius2)
     falloff, drift = falloff_of_frames(samples), balance_drift(samples, surface.owner)
     told: dict[str, Any] = {"vignetting_stops": falloff and round(falloff.stops, 3)}
@@ -64,7 +74,7 @@ def asked_of_its_optics(
         )
         if estimate:
             scan = replace(scan, frames=replace(frames, vignetting=falloff.coefficients))
-    if drift is not None and drifts(drift).any() and in_place:
+    if drift is not None and drifts(drift).any() and in_place and not is_curve(unlike):
         off = [names[k] for k in np.flatnonzero(drifts(drift))]
         doubts.append(
             f"{scan.source.name}: the white balance of {len(off)} of {len(asked)} frames is off "

@@ -46,17 +46,23 @@ def asked_of_its_pixels(
     refuse_turned(surface, rays, scan.frames, scan.turned_images, read, scan.source)
     asked = agreement_of_frames(surface, rays, scan.frames, read, scan.source)
     agrees, astray = asked.agreement, frames_astray(asked.shown)
-    warnings = warned(doubts_about_agreement(agrees, scan.source))
+    disagree = warned(doubts_about_agreement(agrees, asked.shown, scan.source))
     metres = scan.meters_per_unit
     misplaced = warned(
         doubts_about_registration(scan.mesh, rays, asked, astray, scan.source, metres)
     )
-    warnings += misplaced
+    warnings = disagree + misplaced
     if not warnings and not options.refine_poses:
         warnings += warned(doubts_about_steps(scan.mesh, rays, asked, astray, scan.source))
     estimate = options.vignetting == "estimate"
     scan, told, doubts = asked_of_its_optics(
-        scan, surface, rays, read, estimate=estimate, in_place=not misplaced
+        scan,
+        surface,
+        rays,
+        read,
+        estimate=estimate,
+        exposures_estimated=options.exposure == "estimate",
+        in_place=not (disagree or misplaced),
     )
     warnings += warned(doubts)
     told |= {"agreement": agrees and agrees.ratio, "warnings": warnings}

@@ -19,6 +19,7 @@ from usdbrdf.files.frames import FramePixels
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh, across_triangles
+from usdbrdf.texturing.exposures import gains_of_frames
 from usdbrdf.transport.rays import RayScene
 
 MIN_COSINE = calibration.number("agreement.min_cosine")
@@ -190,9 +191,17 @@ def is_doubtful(given: Agreement | None) -> bool:
     return given is None or given.ratio > _AGREES
 
 
-def doubts_about_agreement(found: Agreement | None, source: Path) -> Iterator[str]:
-    """A sentence where the frames hardly agree, under whatever reading of the poses."""
-    if found is not None and is_doubtful(found):
+def doubts_about_agreement(found: Agreement | None, shown: Float, source: Path) -> Iterator[str]:
+    """A sentence where the frames hardly agree, under whatever reading of the poses, and whatever
+    each is brighter or darker by, which is told as that.
+
+    shown  (P, N) logarithms, of which ``found`` was made
+    """
+    if found is None or not is_doubtful(found):
+        return
+    alike = agreement(shown - gains_of_frames(shown).logarithm.astype(np.float32))
+    # Gains take some of what wrong poses do, but never most of it.
+    if alike is None or 2 * alike.ratio > found.ratio:
         yield (
             f"{source.name}: frames that show the same points of the mesh differ by "
             f"{found.ratio:.0%} of what any two pixels do, under every usual reading of the poses. "

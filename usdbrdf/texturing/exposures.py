@@ -26,7 +26,7 @@ from usdbrdf.model.capture import Frames
 
 # Texels whose samples are kept, at most, and samples in all: of many frames it is fewer texels.
 _MOST_TEXELS, _MOST_SAMPLES = 4096, 1 << 21
-_CONTRADICTING = calibration.number("exposures.contradicting") * math.log(2)
+CONTRADICTING = calibration.number("exposures.contradicting") * math.log(2)
 _STANDING_OUT = calibration.number("exposures.standing_out")
 _MOST = calibration.number("exposures.most")
 _OUTLYING = calibration.number("exposures.outlying")
@@ -34,7 +34,7 @@ _OUTLYING = calibration.number("exposures.outlying")
 _OF_SURFACE = calibration.number("exposures.of_surface")
 _AGREEING = calibration.number("exposures.agreeing")
 # Samples of texels that other frames show too, without which a frame is not judged.
-_FEWEST = 24
+FEWEST = 24
 # Steps of the reweighting.
 _STEPS = 8
 # Frames that are named.
@@ -116,7 +116,7 @@ def gains_of_frames(logarithm: Float) -> Gains:
     spreads = [
         np.median(np.abs(o[k])) if k.any() else 0 for o, k in zip(off.T, known.T, strict=True)
     ]
-    enough = count >= _FEWEST
+    enough = count >= FEWEST
     usual = np.median(gain[enough]) if enough.any() else 0.0
     # Beside what the others show: a sample's own share in its texel's mean would hide half of it.
     others = weight.sum(axis=1)[:, None] - weight
@@ -157,7 +157,7 @@ def surfaces_agree(brighter: Double, gain: Double, owner: Int) -> Bool:
     agree = np.zeros(len(gain), np.bool_)
     for i in range(len(gain)):
         shown = np.flatnonzero(np.isfinite(brighter[:, i]))
-        if len(shown) < _FEWEST or gain[i] == 0:
+        if len(shown) < FEWEST or gain[i] == 0:
             continue
         own, off = surface[shown], brighter[shown, i] / gain[i]
         own = np.where(np.bincount(own)[own] >= _OF_SURFACE, own, -1)
@@ -175,7 +175,7 @@ def with_estimated_exposures(frames: Frames, logarithm: Float) -> tuple[Frames, 
     logarithm  (P, N) as in ``Probes``
     """
     found = gains_of_frames(logarithm)
-    known = found.samples >= _FEWEST
+    known = found.samples >= FEWEST
     gain = np.where(known, np.exp(found.logarithm), 1.0)
     off = np.flatnonzero(known & _stands_out(found))
     changed = replace(
@@ -201,7 +201,7 @@ def doubts_about_exposures(off: Mapping[str, float], count: int, source: Path) -
 
 def _stands_out(gains: Gains) -> Bool:
     size = np.abs(gains.logarithm)
-    return np.asarray((size > _CONTRADICTING) & (size > _STANDING_OUT * gains.scatter), np.bool_)
+    return np.asarray((size > CONTRADICTING) & (size > _STANDING_OUT * gains.scatter), np.bool_)
 
 
 def contradicting_frames(frames: Frames, logarithm: Float, owner: Int) -> dict[str, float]:
@@ -214,7 +214,7 @@ def contradicting_frames(frames: Frames, logarithm: Float, owner: Int) -> dict[s
     Raises InputRefused where more than a fifth do and the images are said to be radiance.
     """
     gains = gains_of_frames(logarithm)
-    compared = gains.samples >= _FEWEST
+    compared = gains.samples >= FEWEST
     off = np.flatnonzero(compared & _stands_out(gains))
     off = off[surfaces_agree(gains.brighter[:, off], gains.logarithm[off], owner)]
     factor = {frames.image_paths[i].name: round(math.exp(gains.logarithm[i]), 2) for i in off}
