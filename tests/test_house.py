@@ -365,6 +365,7 @@ ENGINEERING: dict[str, str] = {
     "_OF_FRAMES": "memory",
     "_OF_MEDIAN": "mathematics: of a normal distribution",
     "_OF_PART": "samples that a statistic needs",
+    "_OF_PATTERN": "frames that a statistic needs",
     "_OF_PATTERNS": "bytes",
     "_OF_REFINING": "bytes",
     "_OF_TEXEL": "mathematics: variance of a texel",

@@ -433,7 +433,8 @@ def test_a_lamp_that_only_the_first_round_tells_stays_as_that_tells_it(
 
 
 def test_what_looks_another_way_from_each_side_is_doubted():
-    owner = np.array([0, 0, 0, 1, 2], np.int32)
-    differing = np.array([0.05, 0.4, 0.0])
-    np.testing.assert_allclose(doubt_by_views(differing, owner), [1, 1, 1, 8, 1])
-    assert (doubt_by_views(None, owner) == 1).all()
+    np.testing.assert_allclose(doubt_by_views(np.array([0.05, 0.05, 0.04, 0.4])), [1, 1, 1, 8])
+    # Of most it may not be known, and views that hardly differ at all are as usual.
+    differing = np.array([np.nan, np.nan, np.nan, 0.001, 0.02, 0.09])
+    np.testing.assert_allclose(doubt_by_views(differing), [1, 1, 1, 1, 1, 3])
+    assert (doubt_by_views(np.full(3, np.nan)) == 1).all()

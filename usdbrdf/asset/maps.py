@@ -207,18 +207,19 @@ class AssetMaps:
         """(T,): how many frames measured each texel."""
         return self.map("samples")[:, 0]
 
-    @cached_property
     def differing(self) -> Double:
         """(num_objects,): how far the radiances differ that frames show of one texel, their
         interquartile range next to L_d, in the middle of an object's texels of which it can be
-        told; 0 where there are none."""
-        found = np.zeros(len(self.scene.objects))
+        told; NaN where there are none."""
+        found = np.full(len(self.scene.objects), np.nan)
         for i, obj in enumerate(self.scene.objects):
-            lit, own = self.lit[self.texels.of_object(i)].mean(axis=1), self.texels.of_object(i)
-            told = (self.samples[own] >= _FRAMES_THAT_DIFFER) & (lit > 0)
+            own = self.texels.of_object(i)
+            spread = self.texels.from_image(i, read_exr(self._file(obj, "spread"))).mean(axis=1)
+            lit, often = self.lit[own].mean(axis=1), self.samples[own] >= _FRAMES_THAT_DIFFER
+            # Where nothing could be told of it, a spread of 0 is stored.
+            told = often & (lit > 0) & (spread > 0)
             if told.any():
-                spread = self.texels.from_image(i, read_exr(self._file(obj, "spread")))
-                found[i] = np.median(spread.mean(axis=1)[told] / lit[told])
+                found[i] = np.median(spread[told] / lit[told])
         return found
 
     @property

@@ -48,6 +48,7 @@ _CLOSELY = 8
 # Texels of a part that are asked whether daylight explains them.
 _ASKED = 128
 _WIDER = calibration.number("lamps.wider_than_glints")
+_USUAL_VIEWS = calibration.number("lamps.usual_views")
 _LEAST_OF_LIGHT = calibration.number("lamps.least_of_light")
 _SOME_EXPLAINED, _EXPLAINED = calibration.pair("lamps.explained_by_daylight")
 
@@ -127,12 +128,12 @@ def estimate_clipped_light(
     seed: int,
     said: Mapping[int, bool] = MappingProxyType({}),
     unseen: Bool | None = None,
-    differing: Double | None = None,
+    differing: Callable[[], Double] | None = None,
 ) -> ClippedLight:
     """The light ``lit`` (T, 3) as it is where no lamp clipped, else with the lamps' estimates.
     said: of objects whether they are lamps, where that is known. unseen (T,): the texels of lamps
-    that no frame shows, whose radiance is in ``lit``; None without any. differing (num_objects,):
-    how far views of one texel differ, relative to it; None where that is not known."""
+    that no frame shows, whose radiance is in ``lit``; None without any. differing: tells, as
+    ``AssetMaps.differing``, how far views of one texel differ; None where that is not known."""
     spots = hardly_shown(surface.texels, coverage, said)
     if len(spots):
         given = surface, coverage, frames, spots, seed
@@ -187,13 +188,21 @@ class _Weighing:
     groups: ClippedGroups
     said: Mapping[int, bool]
     unseen: Bool | None
-    differing: Double | None
+    differing: Callable[[], Double] | None
     seed: int
 
     @cached_property
     def _chosen(self) -> tuple[Long, Int]:
         """As of ``_chosen``."""
         return _chosen(self.surface.texels, self.groups, self.coverage.measured, self.seed)
+
+    @cached_property
+    def _doubt(self) -> Double:
+        """(N,), of the texels chosen."""
+        chosen, _ = self._chosen
+        if self.differing is None:
+            return np.ones(len(chosen))
+        return doubt_by_views(self.differing()[self.surface.texels.object_index()[chosen]])
 
     @cached_property
     def _asked(self) -> Asked | None:
@@ -248,7 +257,6 @@ class _Weighing:
         shining = Shining.of(self.surface, rest, self.environment)
         # Of some groups no texel may be left.
         left = np.isin(np.arange(len(groups)), groups.group)
-        owner = texels.object_index()[chosen]
         return Evidence(
             radiance=light[chosen],
             irradiance=irradiance_of_texels(
@@ -257,8 +265,8 @@ class _Weighing:
             lamp_irradiance=np.where(left[:, None, None], self._of_each, np.float32(0)),
             position=texels.position[chosen] / (_UNIT * np.sqrt(texels.area.sum())),
             segment=segment,
-            object=owner.astype(np.int32),
-            doubt=doubt_by_views(self.differing, owner),
+            object=texels.object_index()[chosen].astype(np.int32),
+            doubt=self._doubt,
             prior=groups.priors(),
             shines=groups.lamp,
         )
@@ -302,14 +310,14 @@ class _Weighing:
         return bool(received.mean() > _LEAST_OF_LIGHT * reflected)
 
 
-def doubt_by_views(differing: Double | None, owner: Int) -> Double:
-    """(N,): how many times as far as is usual among texels of objects ``owner`` (N,) the views of
-    their objects differ, at least 1. What looks another way from each side mirrors: the middle of
-    that is what a plain reflector shows by chance alone."""
-    if differing is None:
-        return np.ones(len(owner))
-    of_texel = differing[owner]
-    return np.maximum(of_texel / max(float(np.median(of_texel)), 1e-30), 1)
+def doubt_by_views(differing: Double) -> Double:
+    """(N,): how many times as far as is usual among texels the views of each differ, ``differing``
+    (N,), at least 1, as where that is not known (NaN). What looks another way from each side
+    mirrors, or mixes in a pixel what lies side by side: the middle of that is what a plain
+    reflector shows by chance alone."""
+    known = np.isfinite(differing)
+    usual = max(float(np.median(differing[known])), _USUAL_VIEWS) if known.any() else _USUAL_VIEWS
+    return np.where(known, np.maximum(differing / usual, 1), 1.0)
 
 
 def reflects_other_light(

@@ -360,7 +360,7 @@ def _light(
     outside: Outside | None,
     seed: int,
     said: Mapping[int, bool],
-    differing: Double | None,
+    differing: Callable[[], Double] | None,
 ) -> tuple[ClippedLight, UnseenLamps]:
     """L_d with what hidden surfaces send on, and with the lamps that no frame measures."""
     environment = outside.environment if outside else black_environment()
@@ -430,7 +430,7 @@ def shade_surface(
     sampling: Sampling,
     lightmap_filter: str,
     said: Mapping[int, bool] = MappingProxyType({}),
-    differing: Double | None = None,
+    differing: Callable[[], Double] | None = None,
 ) -> Shaded:
     """Trace S with the light ``lit`` (T, 3), L_d as texturing left it; divide; find the emitters.
 
@@ -438,7 +438,7 @@ def shade_surface(
     frames   which views L_d is from
     outside  the light from outside; None for none
     said     of objects, by number, whether they are lamps, where a person says so
-    differing  of objects, how far the views of one texel differ, relative to it
+    differing  tells how far the views of one texel differ, as ``AssetMaps.differing``
     """
     environment = outside.environment if outside else black_environment()
     # What panes show is sent by what is behind them: they are no lamps, whatever their radiance.

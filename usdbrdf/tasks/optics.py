@@ -25,8 +25,8 @@ from usdbrdf.texturing.optics import (
 from usdbrdf.texturing.response import contradiction_of_frames, doubts_about_response, is_curve
 from usdbrdf.transport.rays import RayScene
 
-# Frames that are asked, at least and at most, and pixels of all beyond the least, which take
-# seconds to read; and how many frames are named.
+# Frames that are asked, at least and at most, and pixels of all, if they are more than the least,
+# which take seconds to read; and how many frames are named.
 _FEWEST_ASKED, _MOST_ASKED, _MOST_PIXELS, _LISTED = 32, 128, 1 << 25, 6
 
 
@@ -57,8 +57,9 @@ def asked_of_its_optics(
     names = [frames.image_paths[i].name for i in asked]
     logarithm[:, astray] = np.nan  # of whose lens and colours nothing is known
     compared = frames.at(asked)
-    shown = logarithm.mean(axis=2)
-    unlike = contradiction_of_frames(shown, surface.point, compared) if in_place else None
+    # By green: where red or blue alone is off, the balance is.
+    green = logarithm[..., 1]
+    unlike = contradiction_of_frames(green, surface.point, compared) if in_place else None
     # Under another curve frames that share little seem to show other things.
     doubts = [] if is_curve(unlike) else [*doubts_about_places(astray, names, scan.source)]
     doubts += doubts_about_response(unlike, compared, scan.source, estimated=exposures_estimated)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from usdbrdf import calibration
 from usdbrdf.errors import first_of
@@ -27,6 +28,8 @@ _BETTER = calibration.number("response.better")
 # Parts of the mesh along each axis, how many groups of them are left out in turn, and how many of
 # a part's points, and of such parts, tell of a frame.
 _ALONG, _GROUPS, _OF_PART, _PARTS = (4, 4, 4), 8, 5, 5
+# Frames of which a pattern is told.
+_OF_PATTERN = 5
 # Standard deviations of a normal distribution for each median distance from the middle.
 _OF_MEDIAN = 1.4826
 _LISTED = 6
@@ -59,13 +62,16 @@ def parts_of_mesh(point: Double) -> Int:
     return part
 
 
-def judged_gains(logarithm: Float, part: Int) -> Judged:
+def judged_gains(logarithm: Float, part: Int, least: float = 0.0) -> Judged:
     """How much brighter each frame shows the same points than the others do.
 
     logarithm  (P, N) of what frames show of points, NaN where they do not
     part       (P,) as of ``parts_of_mesh``
+    least      where no gain is larger, nobody asks how well they are known: errors are 0
     """
     found = gains_of_frames(logarithm)
+    if (np.abs(found.logarithm) <= least).all():
+        return Judged(found.logarithm, np.zeros(len(found.logarithm)))
     without = [gains_of_frames(some).logarithm for some in _without_parts(logarithm, part)]
     error = np.sqrt((_GROUPS - 1) * np.var(without, axis=0))
     for i, brighter in enumerate(found.brighter.T):
@@ -87,24 +93,27 @@ def _without_parts(logarithm: Float, part: Int) -> Iterator[Float]:
         yield logarithm[part % _GROUPS != group]
 
 
-def better_reading(logarithm: Float, part: Int, full: Double, time: Double) -> str:
+def better_reading(logarithm: Float, part: Int, frames: Frames, least: float) -> str:
     """The reading of the pixels under which frames contradict each other far less than as they are
-    given; "" where there is none, as ever where all exposures are equal.
+    given, and most of those that were off by ``least`` or more are no longer; "" where there is
+    none, as ever where all exposures are equal.
 
-    logarithm  (P, N) of the radiance as it is read now
+    logarithm  (P, N) of the radiance as it is read now, divided by the exposure times of ``frames``
     part       (P,) as of ``parts_of_mesh``
-    full, time (N,) radiance at which the sensor is full, and exposure time (seconds), by which the
-               radiance was divided
     """
+    full, time = frames.saturation_radiance, frames.exposure_time
+    if len(time) < _OF_PATTERN or np.ptp(time) == 0:
+        return ""
     top = np.log(full)
     if not np.isfinite(top).all():  # the brightest that any frame shows is about full
         top = np.nanmax(logarithm + np.log(time)) - np.log(time)
     readings: dict[str, Callable[[Double], Double]] = {
         CODED: lambda x: _log_decoded(x - top) + top,
         DECODED: lambda x: _log_encoded(x - top) + top,
-        UNDIVIDED: lambda x: np.asarray(x - np.log(time)),
-        DIVIDED_TWICE: lambda x: np.asarray(x + np.log(time)),
     }
+    if frames.radiometric:  # photographs are divided here
+        readings[UNDIVIDED] = lambda x: np.asarray(x - np.log(time))
+        readings[DIVIDED_TWICE] = lambda x: np.asarray(x + np.log(time))
     # Every other point tells as well, in half of the time.
     some = [*_without_parts(logarithm[::2], part[::2])]
     given = np.array([_contradiction(own) for own in some])
@@ -114,7 +123,12 @@ def better_reading(logarithm: Float, part: Int, full: Double, time: Double) -> s
         other = np.array([_contradiction(one) for one in read_so])
         if (other < _BETTER * given).all():
             sound[name] = float(other.mean())
-    return min(sound, key=lambda name: sound[name], default="")
+    if not sound:
+        return ""
+    best = min(sound, key=lambda name: sound[name])
+    left = judged_gains(readings[best](logarithm.astype(np.float64)).astype(np.float32), part)
+    before = judged_gains(logarithm, part).off(least)
+    return best if 2 * int(left.off(least).sum()) < int(before.sum()) else ""
 
 
 def _contradiction(logarithm: Float) -> float:
@@ -166,11 +180,11 @@ def contradiction_of_frames(
     """
     least = _TOLD if frames.radiometric else CONTRADICTING
     part = parts_of_mesh(point)
-    judged = judged_gains(logarithm, part)
+    judged = judged_gains(logarithm, part, least)
     off = judged.off(least)
     if not off.any():
         return None
-    reading = better_reading(logarithm, part, frames.saturation_radiance, frames.exposure_time)
+    reading = better_reading(logarithm, part, frames, least)
     worst = sorted(np.flatnonzero(off).tolist(), key=lambda i: -abs(judged.gain[i]))
     drift = _drift(judged)
     over = judged._replace(gain=judged.gain - drift * _places(len(off)))
@@ -185,14 +199,12 @@ def _places(count: int) -> Double:
 
 
 def _drift(judged: Judged) -> float:
-    """By how much frames become brighter along their list, in all: the straight line in the middle
-    of those through two gains each (Theil, "A rank-invariant method", 1950)."""
-    known = np.flatnonzero(np.isfinite(judged.error))
-    first, second = np.triu_indices(len(known), 1)
-    if not len(first):
+    """By how much frames become brighter along their list, in all; 0 of few."""
+    known = np.isfinite(judged.error)
+    if np.count_nonzero(known) < _OF_PATTERN:
         return 0.0
-    place, gain = _places(len(judged.gain))[known], judged.gain[known]
-    return float(np.median((gain[second] - gain[first]) / (place[second] - place[first])))
+    place = _places(len(judged.gain))
+    return float(stats.theilslopes(judged.gain[known], place[known]).slope)
 
 
 def doubts_about_response(
@@ -220,11 +232,11 @@ def doubts_about_response(
             "--exposure estimate, which divides out what each is off by. [capture.exposure]"
         )
     else:
-        equal = np.ptp(frames.exposure_time) == 0
-        cause = "differ, though all pass for equal" if equal else "are not those that are stated"
+        curve = "" if frames.radiometric else ", or the camera applied a tone curve"
         yield (
-            f"{what}. Their exposures {cause}: correct them, leave these frames out, or run ingest "
-            "with --exposure estimate, which divides out what each is off by. [capture.exposure]"
+            f"{what}. Their exposures are not what they pass for{curve}: correct them, leave these "
+            "frames out, or run ingest with --exposure estimate, which divides out what each is "
+            "off by. [capture.exposure]"
         )
 
 
