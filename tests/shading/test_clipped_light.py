@@ -433,7 +433,8 @@ def test_a_lamp_that_only_the_first_round_tells_stays_as_that_tells_it(
 
 
 def test_what_looks_another_way_from_each_side_is_doubted():
-    np.testing.assert_allclose(doubt_by_views(np.array([0.05, 0.05, 0.04, 0.4])), [1, 1, 1, 8])
+    plain = np.full(9, 0.05)
+    np.testing.assert_allclose(doubt_by_views(np.append(plain, [0.04, 0.4])), [1] * 10 + [8])
     # Of most it may not be known, and views that hardly differ at all are as usual.
     differing = np.array([np.nan, np.nan, np.nan, 0.001, 0.02, 0.09])
     np.testing.assert_allclose(doubt_by_views(differing), [1, 1, 1, 1, 1, 3])

@@ -48,7 +48,7 @@ _CLOSELY = 8
 # Texels of a part that are asked whether daylight explains them.
 _ASKED = 128
 _WIDER = calibration.number("lamps.wider_than_glints")
-_USUAL_VIEWS = calibration.number("lamps.usual_views")
+_PLAINEST, _LEAST_DIFFERING = calibration.pair("lamps.plain_views")
 _LEAST_OF_LIGHT = calibration.number("lamps.least_of_light")
 _SOME_EXPLAINED, _EXPLAINED = calibration.pair("lamps.explained_by_daylight")
 
@@ -311,13 +311,13 @@ class _Weighing:
 
 
 def doubt_by_views(differing: Double) -> Double:
-    """(N,): how many times as far as is usual among texels the views of each differ, ``differing``
-    (N,), at least 1, as where that is not known (NaN). What looks another way from each side
-    mirrors, or mixes in a pixel what lies side by side: the middle of that is what a plain
-    reflector shows by chance alone."""
+    """(N,): how many times as far as those of the plainest of them the views of texels differ,
+    ``differing`` (N,), at least 1, as where that is not known (NaN). What looks another way from
+    each side mirrors, or mixes in a pixel what lies side by side: the middle of that is what a
+    plain reflector shows by chance alone."""
     known = np.isfinite(differing)
-    usual = max(float(np.median(differing[known])), _USUAL_VIEWS) if known.any() else _USUAL_VIEWS
-    return np.where(known, np.maximum(differing / usual, 1), 1.0)
+    plain = float(np.quantile(differing[known], _PLAINEST)) if known.any() else 0.0
+    return np.where(known, np.maximum(differing / max(plain, _LEAST_DIFFERING), 1), 1.0)
 
 
 def reflects_other_light(

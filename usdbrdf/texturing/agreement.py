@@ -153,10 +153,10 @@ def agreement(logarithm: Float, judged: Bool | None = None) -> Agreement | None:
     error = float(np.sqrt((by_point**2).sum()) / samples)
     level = value[known[rows]]
     spread = max(float(np.abs(level - np.median(level)).mean()), 1e-6)
-    return Agreement(scatter, scatter / spread, samples, error / spread, _spread_in_frames(value))
+    return Agreement(scatter, scatter / spread, samples, error / spread, spread_in_frames(value))
 
 
-def _spread_in_frames(value: Double) -> float:
+def spread_in_frames(value: Float | Double) -> float:
     """Mean difference of logarithms (P, N) from the median of their frame."""
     frames = [column[np.isfinite(column)] for column in value.T]
     off = [np.abs(shown - np.median(shown)) for shown in frames if len(shown)]

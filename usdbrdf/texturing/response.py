@@ -20,6 +20,7 @@ from usdbrdf import calibration
 from usdbrdf.errors import first_of
 from usdbrdf.model.arrays import Bool, Double, Float, Int
 from usdbrdf.model.capture import Frames
+from usdbrdf.texturing.agreement import spread_in_frames
 from usdbrdf.texturing.exposures import CONTRADICTING, FEWEST, gains_of_frames
 
 _TOLD = calibration.number("response.told") * math.log(2)
@@ -137,9 +138,8 @@ def _contradiction(logarithm: Float) -> float:
     compared = found.samples >= FEWEST
     if not compared.any():
         return 0.0
-    shown = [column[np.isfinite(column)] for column in logarithm[:, compared].T]
-    variety = np.mean([np.abs(column - np.median(column)).mean() for column in shown])
-    return float(np.abs(found.logarithm[compared]).mean() / max(float(variety), 1e-6))
+    variety = max(spread_in_frames(logarithm[:, compared]), 1e-6)
+    return float(np.abs(found.logarithm[compared]).mean()) / variety
 
 
 def _log_decoded(code: Double) -> Double:
