@@ -94,10 +94,10 @@ def _without_parts(logarithm: Float, part: Int) -> Iterator[Float]:
         yield logarithm[part % _GROUPS != group]
 
 
-def better_reading(logarithm: Float, part: Int, frames: Frames, least: float) -> str:
+def better_reading(logarithm: Float, part: Int, frames: Frames, off: Bool, least: float) -> str:
     """The reading of the pixels under which frames contradict each other far less than as they are
-    given, and most of those that were off by ``least`` or more are no longer; "" where there is
-    none, as ever where all exposures are equal.
+    given, and most of those that are ``off`` (N,), by ``least`` or more, are no longer; "" where
+    there is none, as ever where all exposures are equal.
 
     logarithm  (P, N) of the radiance as it is read now, divided by the exposure times of ``frames``
     part       (P,) as of ``parts_of_mesh``
@@ -128,8 +128,7 @@ def better_reading(logarithm: Float, part: Int, frames: Frames, least: float) ->
         return ""
     best = min(sound, key=lambda name: sound[name])
     left = judged_gains(readings[best](logarithm.astype(np.float64)).astype(np.float32), part)
-    before = judged_gains(logarithm, part).off(least)
-    return best if 2 * int(left.off(least).sum()) < int(before.sum()) else ""
+    return best if 2 * int(left.off(least).sum()) < int(off.sum()) else ""
 
 
 def _contradiction(logarithm: Float) -> float:
@@ -184,7 +183,7 @@ def contradiction_of_frames(
     off = judged.off(least)
     if not off.any():
         return None
-    reading = better_reading(logarithm, part, frames, least)
+    reading = better_reading(logarithm, part, frames, off, least)
     worst = sorted(np.flatnonzero(off).tolist(), key=lambda i: -abs(judged.gain[i]))
     drift = _drift(judged)
     over = judged._replace(gain=judged.gain - drift * _places(len(off)))
