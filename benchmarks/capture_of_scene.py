@@ -1,14 +1,16 @@
 """A capture with truth of a scene that somebody else made for Mitsuba (0.6 or 3).
 
     python benchmarks/capture_of_scene.py SCENE.xml OUTPUT [--frames 48] [--views 8] [--width 320]
-        [--samples 48] [--up Y] [--metres-per-unit 1] [--within METRES] [--seed 0]
+        [--samples 48] [--up Y] [--metres-per-unit 1] [--within METRES] [--around DEGREES]
+        [--seed 0]
 
 Path traced with the scene's own materials and lights, so independent of this program's BRDF. Frames
 have three exposures in turn, a sensor's noise, 12 bits and saturation, and go through Open Image
 Denoise where it is installed (extra ``denoise``; the output says so).
 
 Cameras stand in the free space that is connected to the scene's own camera and look where surfaces
-were seen least.
+were seen least; with --around DEGREES as far as that from it, around what the scene's camera looks
+at, and look there.
 
 truth/: clean views from poses that are not among the frames (view_NN.exr, views.json), the
 material's albedo there (albedo_NN.exr), materials.json (kind, phi, psi, F0, and of coated materials
@@ -73,6 +75,12 @@ def main() -> int:
         default=np.inf,
         help="metres from where the scene's own camera looks: the rest is a backdrop",
     )
+    parser.add_argument(
+        "--around",
+        type=float,
+        default=None,
+        help="degrees from the scene's own camera, around what that looks at: a thing in the open",
+    )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     if options.output.exists():
@@ -115,11 +123,18 @@ def chosen_cameras(rays: RayScene, own: Array, options: argparse.Namespace) -> l
     up = np.eye(3)[" YZ".index(options.up)]
     eye, ahead = own[:3, 3], unit(own[:3, 2])
     aim = eye + ahead * distances(rays, eye, ahead[None])[0]
+    if options.around is None:
+        poses = [
+            pose
+            for place in free_places(rays, eye, up, rng)
+            if not np.linalg.norm(place - aim) > FROM_AFAR * options.within
+            for pose in looks_from(place, up, rng)
+        ]
+    else:
+        poses = looks_around(eye, aim, options.around, up, rng)
     candidates = [
         Candidate(pose, pieces)
-        for place in free_places(rays, eye, up, rng)
-        if not np.linalg.norm(place - aim) > FROM_AFAR * options.within
-        for pose in looks_from(place, up, rng)
+        for pose in poses
         if (pieces := pieces_seen(rays, pose, options, aim)) is not None
     ]
     if len(candidates) < 2 * (options.frames + options.views):
@@ -183,12 +198,32 @@ def looks_from(place: Array, up: Array, rng: np.random.Generator) -> list[Array]
         turn = 2 * np.pi * (k + rng.random()) / LOOKS
         pitch = np.radians(rng.uniform(*PITCH))
         level = np.cos(turn) * ahead + np.sin(turn) * side
-        back = -(np.cos(pitch) * level + np.sin(pitch) * up)
-        right = unit(np.cross(up, back))
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(back, right), back, place], axis=1)
-        poses.append(pose)
+        poses.append(looking(place, np.cos(pitch) * level + np.sin(pitch) * up, up))
     return poses
+
+
+def looks_around(
+    eye: Array, aim: Array, degrees: float, up: Array, rng: np.random.Generator
+) -> list[Array]:
+    """Poses (4, 4), up to so many degrees from the ``eye`` and as far away, that look near the
+    ``aim``."""
+    reach, poses = float(np.linalg.norm(eye - aim)), []
+    while len(poses) < PLACES:
+        away = unit(rng.normal(size=3))
+        if away @ unit(eye - aim) < np.cos(np.radians(degrees)):
+            continue
+        place = aim + away * reach * rng.uniform(0.7, 1.1)
+        near = aim + 0.2 * reach * rng.uniform(-1, 1, size=3)
+        poses.append(looking(place, unit(near - place), up))
+    return poses
+
+
+def looking(place: Array, ahead: Array, up: Array) -> Array:
+    """The pose (4, 4), OpenGL's axes, there, towards a unit vector."""
+    right = unit(np.cross(up, -ahead))
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(-ahead, right), -ahead, place], axis=1)
+    return pose
 
 
 def pieces_seen(
@@ -199,7 +234,8 @@ def pieces_seen(
     origins, directions = camera.rays(camera.pixels())
     hits = rays.closest(origins, directions)
     met = hits.face >= 0
-    if met.mean() < 0.5 or np.median(hits.distance[met]) < 0.8:
+    near = 0.8 if options.around is None else 0.2
+    if met.mean() < 0.5 or np.median(hits.distance[met]) < near:
         return None
     points = origins[met] + directions[met] * hits.distance[met, None]
     points = points[~(np.linalg.norm(points - aim, axis=1) > options.within)]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.physics.surfaces import World, quad, room, world_of
+from usdbrdf.shading.doubt import shines_evenly
 from usdbrdf.shading.shaded import find_emitters
 
 LAMP = 6
@@ -71,6 +72,34 @@ def test_what_exceeds_light_that_is_known_badly_is_no_emitter(world: World, lit:
     assert found(0.05).is_lamp[2]
     lit[world.texels.object_index() == 2] = 2.6 * SHADING / np.pi
     assert found(np.inf).is_lamp[2]
+
+
+def test_what_does_not_follow_the_light_on_it_shines_however_badly_that_is_known(
+    world: World, lit: np.ndarray
+):
+    own = np.flatnonzero(world.texels.object_index() == 2)
+    shading = np.full_like(lit, SHADING)
+    # As a panel beside a lamp: half of it has twice as much light as the other half.
+    shading[own[: len(own) // 2]] *= 2
+    noise, everywhere = 0.05 * shading, np.ones(len(lit), bool)
+    lit[own] = 1.5 * 2 * SHADING / np.pi
+    measured = world.texels, lit, shading
+
+    def is_lamp(error=noise, seen=everywhere):
+        even = shines_evenly(*measured, error, seen)
+        doubt = np.where(even, 0, 0.6)
+        return even[2], find_emitters(*measured, seen, ~everywhere, doubt=doubt).is_lamp[2]
+
+    assert is_lamp() == (True, True)
+    assert not shines_evenly(*measured, noise, everywhere)[[0, 1, 3, 4, 5, LAMP]].any()
+    # Noise of S that large makes a pattern like it of any wall.
+    assert is_lamp(error=0.5 * shading) == (False, False)
+    assert is_lamp(seen=~np.isin(np.arange(len(lit)), own)) == (False, False)
+    # A reflector follows, and paint of two kinds does not cancel it.
+    lit[own] = 1.5 * shading[own] / np.pi
+    assert is_lamp() == (False, False)
+    lit[own[::3]] *= 0.7
+    assert is_lamp() == (False, False)
 
 
 def test_the_inside_of_a_bulb_which_no_frame_shows_does_not_keep_it_from_being_a_lamp(

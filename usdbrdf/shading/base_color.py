@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from usdbrdf import calibration
-from usdbrdf.model.arrays import Bool, Float
+from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.texturing.inpaint import inpaint
 
@@ -21,9 +22,9 @@ _TINY = float(np.finfo(np.float32).tiny)
 _MOST_RATIO = calibration.number("emitters.most_ratio")
 
 
-def clear_of(doubt: float) -> float:
+def clear_of(doubt: npt.ArrayLike) -> Double:
     """pi L_d / S above which a texel shines, where S has the relative standard error ``doubt``."""
-    return min(EMITTER_RATIO * (1 + 2 * doubt), _MOST_RATIO)
+    return np.minimum(EMITTER_RATIO * (1 + 2 * np.asarray(doubt, np.float64)), _MOST_RATIO)
 
 
 def albedo_from_irradiance(

@@ -6,12 +6,15 @@ import math
 
 import numpy as np
 
-from usdbrdf.model.arrays import Bool, Float
+from usdbrdf import calibration
+from usdbrdf.model.arrays import Bool, Double, Float
 from usdbrdf.model.texels import Texels
 from usdbrdf.shading.clipped_light import ClippedLight
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.unseen_lamps import UnseenLamps
 from usdbrdf.transport.environment import mean_radiance
+
+_EVEN = calibration.number("emitters.even")
 
 
 def doubt_of_outside(outside: Outside | None, lit: Float, measured: Bool) -> float:
@@ -54,3 +57,38 @@ def doubt_of_irradiance(
     told = measured & ~inferred
     every = max(power, float(texels.area[told] @ kept[told]), 1e-30)
     return math.hypot(doubt / every, doubt_of_outside(outside, light.lit, measured))
+
+
+def shines_evenly(
+    texels: Texels, radiance: Float, irradiance: Float, error: Float, measured: Bool
+) -> Bool:
+    """Objects (num_objects,) that are ``measured`` (T,) to be evenly bright in light that is not.
+
+    A reflector follows what reaches it, however badly the level of that is known: log L_d varies
+    as much as log S does, and by its texture more. radiance, L_d; irradiance, S, and its standard
+    ``error``, whose part of the variance is taken off: (T, 3).
+    """
+    light, reaches = radiance.mean(axis=1), irradiance.mean(axis=1)
+    noise = error.mean(axis=1) / np.maximum(reaches, 1e-30)
+    told = measured & (light > 0) & (reaches > 0)
+    found = np.zeros(len(texels.resolution), np.bool_)
+    for i in range(len(found)):
+        own = texels.of_object(i)
+        some = told[own]
+        if not some.any():
+            continue
+        area = texels.area[own][some].astype(np.float64)
+        of_noise = float(np.average(noise[own][some] ** 2, weights=area))
+        of_light, of_irradiance = (
+            _variance(np.log(values[own][some], dtype=np.float64), area)
+            for values in (light, reaches)
+        )
+        # What the error itself makes most of says nothing.
+        found[i] = of_irradiance > 2 * of_noise
+        found[i] &= of_light < _EVEN * (of_irradiance - of_noise)
+    return found
+
+
+def _variance(values: Double, weights: Double) -> float:
+    mean = np.average(values, weights=weights)
+    return float(np.average((values - mean) ** 2, weights=weights))

@@ -24,7 +24,7 @@ from usdbrdf.options import BEFORE_FILTER, Sampling
 from usdbrdf.shading.base_color import albedo_map, clear_of
 from usdbrdf.shading.clipped_groups import clipped_groups
 from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
-from usdbrdf.shading.doubt import doubt_of_irradiance, doubt_of_outside
+from usdbrdf.shading.doubt import doubt_of_irradiance, doubt_of_outside, shines_evenly
 from usdbrdf.shading.hidden_light import KnownLamps, said_to_shine, with_hidden_light
 from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.panes import beside_panes
@@ -66,7 +66,7 @@ def find_emitters(
     unknown_lamp: float = 0.0,
     unseen_lamps: Int | None = None,
     said: Mapping[int, bool] = MappingProxyType({}),
-    doubt: float = 0.0,
+    doubt: float | Double = 0.0,
     observed: Bool | None = None,
 ) -> Emitters:
     """Emissive texels from L_d and S (T, 3), grouped per object.
@@ -78,13 +78,14 @@ def find_emitters(
     unseen_lamps: numbers of the objects that shine though no frame shows them; of these
     ``lower_bound`` is True
     said: of objects whether they shine as a whole or not at all, whatever they show
-    doubt: relative standard error of S, of which what shines must be clear: what stands in a sun
-    that is known badly is no lamp
+    doubt: relative standard error of S, of all or (num_objects,), of which what shines must be
+    clear: what stands in a sun that is known badly is no lamp
     observed (T,): by which of the texels seen or clipped an object is a lamp as a whole, all by
     default: of a bulb of glass the inside, which no frame shows, is lit by all the rest of it
     """
     light = radiance.mean(axis=1)
-    shines = np.pi * light > clear_of(doubt) * irradiance.mean(axis=1)
+    limit = np.broadcast_to(clear_of(doubt), len(texels.resolution))[texels.object_index()]
+    shines = np.pi * light > limit * irradiance.mean(axis=1)
     # A texel that no light reaches is dark, not a lamp: it must also beat the scene's median.
     shines &= light > np.median(light)
     shines &= clipped | (radiance.max(axis=1) >= unknown_lamp)
@@ -455,8 +456,11 @@ def shade_surface(
     may_shine = light.may_shine(coverage.clipped)
     doubt = doubt_of_irradiance(texels, light, unseen, outside, seen, irradiance)
     dimmest = light.least_of_lamps(clear_of(doubt) / np.pi * irradiance.max(axis=1))
+    # What shows by its evenness that it shines need not be clear of lamps that are known badly.
+    even = shines_evenly(texels, light.lit, irradiance, traced.standard_error, seen)
+    of_object = np.where(even, doubt_of_outside(outside, light.lit, seen), doubt)
     emitters = find_emitters(
-        texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt,
+        texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, of_object,
         coverage.observed,
     )  # fmt: skip
     told = coverage.tells_albedo
