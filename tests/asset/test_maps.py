@@ -46,7 +46,7 @@ def test_every_map_is_decoded_once(tmp_path, monkeypatch: pytest.MonkeyPatch):
     often = maps.samples >= 3
     told = [often[maps.texels.of_object(i)].any() for i in range(len(maps.scene.objects))]
     assert any(told)
-    np.testing.assert_allclose(maps.differing(), np.where(told, 0.5, np.nan), rtol=1e-3)
+    np.testing.assert_allclose(maps.differing, np.where(told, 0.5, np.nan), rtol=1e-3)
 
 
 def test_light_that_was_inferred_is_doubted_by_its_errors(tmp_path, monkeypatch):

@@ -118,6 +118,35 @@ def test_to_see_everything_twice_tells_of_the_same_metal():
     np.testing.assert_allclose(once.f0, F0, atol=0.1)
 
 
+def test_a_metal_in_light_that_is_known_badly_is_found_by_what_changes_with_the_view():
+    """A texel's own error of what it mirrors is no more against a metal than a diffuse part of the
+    texel's own is for a dielectric."""
+    rng = np.random.default_rng(5)
+    known = np.exp(0.5 * rng.standard_normal(TEXELS))[TEXEL][:, None]
+    shown = 0.5 + 0.2 * _incident(1)
+    dim = np.where(rng.random((len(TEXEL), 1)) < 0.1, 1.3, 1.0) * shown
+    radiance = (0.6 * dim * known).astype(np.float32)
+
+    def basis(seed: int) -> Any:
+        def of_phis(phis: Any) -> tuple[np.ndarray, np.ndarray]:
+            _, slope = _basis(seed)(phis)
+            blur = slope / F0_OF_PSI - _incident(1)[..., None]
+            slope = F0_OF_PSI * (dim[..., None] + 0.2 * blur)
+            return np.zeros_like(slope), slope.astype(np.float32)
+
+        return of_phis
+
+    light = np.full((len(TEXEL), 3), 1.5, np.float32)
+    dielectric = LobeEstimate(PHI, 1.0, 0.02, 0.1, 0.0, 1.0, 0.9)
+    metal = conductor_of(radiance, TEXEL, light, (basis(2), basis(3)), dielectric)
+    assert metal is not None
+    np.testing.assert_allclose(metal.f0, 0.6, atol=0.08)
+    # What does not change with the view as a metal's does is none, however bright.
+    still = np.bincount(TEXEL, radiance.mean(axis=1)) / np.bincount(TEXEL)
+    plain = np.repeat(still[TEXEL][:, None], 3, axis=1).astype(np.float32)
+    assert conductor_of(plain, TEXEL, light, (basis(2), basis(3)), dielectric) is None
+
+
 def test_a_lamp_that_rays_find_and_the_frame_does_not_show_is_no_evidence():
     """Its ray outweighs all others of the mirror in a sum of squares."""
     radiance = ((0.01 + F0) * _incident(1)).astype(np.float32)

@@ -19,12 +19,8 @@ from usdbrdf.options import Sampling
 from usdbrdf.shading import clipped_light, lamp_light
 from usdbrdf.shading.clipped_emitters import UNTOLD, EstimatedRadiance, nothing_known
 from usdbrdf.shading.clipped_groups import ClippedGroups
-from usdbrdf.shading.clipped_light import (
-    ClippedLight,
-    _with_estimates,
-    doubt_by_views,
-    estimate_clipped_light,
-)
+from usdbrdf.shading.clipped_light import ClippedLight, _with_estimates, estimate_clipped_light
+from usdbrdf.shading.outside_light import doubt_by_views
 from usdbrdf.shading.shaded import shade_surface
 from usdbrdf.transport.environment import Environment, Sun, black_environment
 from usdbrdf.transport.irradiance import irradiance_at, tiles_of_texels

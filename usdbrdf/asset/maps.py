@@ -207,6 +207,7 @@ class AssetMaps:
         """(T,): how many frames measured each texel."""
         return self.map("samples")[:, 0]
 
+    @cached_property
     def differing(self) -> Double:
         """(num_objects,): how far the radiances differ that frames show of one texel, their
         interquartile range next to L_d, in the middle of an object's texels of which it can be

@@ -4,8 +4,9 @@ dielectric that explains the same samples.
 A conductor's radiance is base + F0 slope / 0.08 in each channel, whatever the texel; a dielectric's
 is a diffuse part that is free of each texel, or one albedo of the object times S, and a lobe of F0
 up to 0.08. The likelihood of the samples under each, errors relative to what the texel shows and of
-one unknown size, decides; free diffuse parts are paid for, being integrated over all that they are
-likely to be (H. Jeffreys, "Theory of Probability", 1961).
+one unknown size, decides. What is free of each texel, a diffuse part, or the error of the light
+that a metal mirrors there, is paid for, being integrated over all that it is likely to be
+(H. Jeffreys, "Theory of Probability", 1961).
 """
 
 from __future__ import annotations
@@ -83,18 +84,13 @@ def conductor_of(
     one, other = ((base + psi * slope)[..., 0] for base, slope in found)
     diffuse = irradiance / np.pi / level
     albedo = _least_squares(seen, (one, other), (diffuse, diffuse))
-    rests = seen - one, seen - other
-    uniform = _size(*(rest - albedo * diffuse for rest in rests))
-    # Each texel's own mean takes its share of the errors with it, and was before about as far from
-    # the one albedo as that model is off.
-    means = [_without_means(rest, texel, views) for rest in rests]
-    share = count / len(texel)
-    own = _size(*means) / math.sqrt(max(1 - share, share))
-    paid = share * math.log(max(uniform, own) / (own * math.sqrt(2 * math.pi * share)))
-    textured = math.log(own) + max(paid, 0.0)
-    clearer = min(math.log(uniform), textured) - math.log(float(errors[best]))
+    of_best = [(base[..., best], slope[..., best]) for base, slope in lobes]
+    of_metal = [seen - base - f0 * slope for base, slope in of_best]
+    of_rival = [seen - part - albedo * diffuse for part in (one, other)]
+    clearer = _log_error(of_rival, texel) - _log_error(of_metal, texel)
     if clearer < _CLEARER and not certain:
         return None
+    f0 = _median_of_texels(seen, of_best, f0, texel)
     likely = np.exp(-0.5 * count * (np.log(errors / errors[best])))
     likely *= np.gradient(np.array(_PHIS))
     likely /= likely.sum()
@@ -138,6 +134,41 @@ def _least_squares(
         one, other = (_cut(seen - b - f0 * s) for b, s in zip(base, slope, strict=True))
         found[k], left[k] = f0, (one * other).mean(axis=0)
     return found[left.argmin(axis=0), range(3)]
+
+
+def _median_of_texels(
+    seen: Double, lobes: list[tuple[Double, Double]], f0: Double, texel: Long
+) -> Double:
+    """The reflectance (3,) in [0, 1] that half of the texels show more than, with ``f0`` (3,) by
+    least squares as a start: errors of the light that a texel mirrors, the same in all views, are
+    errors of the slope, and make that too small."""
+    base, slope = (sum(parts) / 2 for parts in zip(*lobes, strict=True))
+    used = np.abs(seen - base - f0 * slope) < _FURTHEST
+    count = int(texel.max()) + 1
+    shown, mirrored = (
+        np.stack([np.bincount(texel, channel, count) for channel in (used * values).T], axis=-1)
+        for values in (seen - base, slope)
+    )
+    told = mirrored > 1e-9 * mirrored.max()
+    found = [
+        np.median(shown[own, c] / mirrored[own, c]) if own.any() else f0[c]
+        for c, own in enumerate(told.T)
+    ]
+    return np.asarray(np.clip(found, 0, 1), np.float64)
+
+
+def _log_error(rests: list[Double], texel: Long) -> float:
+    """ln of the size of the errors, (P, 3) by two predictions with independent noise, that a model
+    leaves of samples; where that explains more, of the model in which each texel is off by a value
+    of its own in all views: a diffuse part besides, or what is wrong with the light it mirrors."""
+    uniform, views = _size(*rests), np.bincount(texel)
+    share = len(views) / len(texel)
+    # Each texel's own mean takes its share of the errors with it, and was before about as far from
+    # that of all as the model of one value is off.
+    means = [_without_means(rest, texel, views) for rest in rests]
+    own = _size(*means) / math.sqrt(max(1 - share, share))
+    paid = share * math.log(max(uniform, own) / (own * math.sqrt(2 * math.pi * share)))
+    return min(math.log(uniform), math.log(own) + max(paid, 0.0))
 
 
 def _without_means(values: Double, texel: Long, views: Long) -> Double:

@@ -35,7 +35,7 @@ from usdbrdf.shading.clipped_groups import ClippedGroups, clipped_groups, hardly
 from usdbrdf.shading.gloss import angles_of_glare, mirrored_to_frames
 from usdbrdf.shading.hidden_light import KnownLamps, light_of_hidden, said_to_shine
 from usdbrdf.shading.lamp_light import looked_at_closely
-from usdbrdf.shading.outside_light import Asked
+from usdbrdf.shading.outside_light import Asked, doubt_by_views
 from usdbrdf.transport.environment import Environment, black_environment
 from usdbrdf.transport.lit_scene import TexturedScene
 
@@ -48,7 +48,6 @@ _CLOSELY = 8
 # Texels of a part that are asked whether daylight explains them.
 _ASKED = 128
 _WIDER = calibration.number("lamps.wider_than_glints")
-_PLAINEST, _LEAST_DIFFERING = calibration.pair("lamps.plain_views")
 _LEAST_OF_LIGHT = calibration.number("lamps.least_of_light")
 _SOME_EXPLAINED, _EXPLAINED = calibration.pair("lamps.explained_by_daylight")
 
@@ -308,16 +307,6 @@ class _Weighing:
         received = irradiance_of_texels(self.surface, shining, outside, chosen, self.seed)
         reflected = np.pi * self.lit[chosen].mean()
         return bool(received.mean() > _LEAST_OF_LIGHT * reflected)
-
-
-def doubt_by_views(differing: Double) -> Double:
-    """(N,): how many times as far as those of the plainest of them the views of texels differ,
-    ``differing`` (N,), at least 1, as where that is not known (NaN). What looks another way from
-    each side mirrors, or mixes in a pixel what lies side by side: the middle of that is what a
-    plain reflector shows by chance alone."""
-    known = np.isfinite(differing)
-    plain = float(np.quantile(differing[known], _PLAINEST)) if known.any() else 0.0
-    return np.where(known, np.maximum(differing / max(plain, _LEAST_DIFFERING), 1), 1.0)
 
 
 def reflects_other_light(

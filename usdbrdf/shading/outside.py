@@ -9,7 +9,7 @@ irradiance and the patches' and lamps' radiance (``outside_light``).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from types import MappingProxyType
@@ -153,9 +153,10 @@ def estimated_outside(
     z_up: bool,
     seed: int,
     said: Mapping[int, bool] = MappingProxyType({}),
+    differing: Callable[[], Double] | None = None,
 ) -> Outside | None:
     """What the frames show of the surroundings, and what they tell of the rest. said: of objects
-    whether they are lamps, where that is known."""
+    whether they are lamps, where that is known; differing: as of ``levelled``."""
 
     def compute() -> dict[str, Array]:
         seen = surroundings_from_frames(surface.light_rays, frames, z_up)
@@ -164,7 +165,7 @@ def estimated_outside(
         light = light_of_hidden(surface, lit, coverage, known, seed, lamps)
         mirrored = mirroring(surface, light, frames, seed)
         given = surface, light, coverage, seen, z_up, seed
-        found = light_from_outside(*given, mirrored, said)
+        found = light_from_outside(*given, mirrored, said, differing)
         return found.arrays() if found else {"nothing": np.zeros(0)}
 
     arrays = run.checkpoint("outside", compute)
@@ -180,11 +181,11 @@ def light_from_outside(
     seed: int,
     mirrored: Mirrored | None = None,
     said: Mapping[int, bool] = MappingProxyType({}),
+    differing: Callable[[], Double] | None = None,
 ) -> Outside | None:
     """What lights the scan ``lit`` (T, 3), L_d, from outside; None where hardly a direction of its
     light leaves it. seen: what the frames show of it; mirrored: what surfaces mirror to these, None
-    where ``lit`` holds nothing of that; said: of objects whether they are lamps, where that is
-    known."""
+    where ``lit`` holds nothing of that; said, differing: as of ``estimated_outside``."""
     asked = asked_texels(surface.texels, lit, coverage, seed)
     if asked is None:
         return None
@@ -212,7 +213,7 @@ def light_from_outside(
     error = jackknife(*told.with_sun, told.found)
     sun_shines = _sun_shines(told, error)
     told, error = _in_shadows(look, told, error) if sun_shines else _sunless(look, told)
-    found = levelled(*told.with_sun, told.found)
+    found = levelled(*told.with_sun, told.found, differing)
     sky, of_sky = np.exp(found.log_radiance[: len(look.used)]), error[: len(look.used)].max(axis=1)
     # By the light that each brings: nobody asks how dark dark ground is.
     weight = told.sources.share[: len(look.used)].mean(axis=1) * sky.mean(axis=1)

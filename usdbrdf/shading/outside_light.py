@@ -16,6 +16,7 @@ fixes the level of the light where next to nothing that was seen lights the scan
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -348,14 +349,31 @@ def gloss_of_scene(asked: Asked, sources: Sources, sent_on: Double, *others: Dou
     return with_gloss(min(_GLOSS, key=cost))
 
 
+_PLAINEST, _LEAST_DIFFERING = calibration.pair("lamps.plain_views")
+
+
+def doubt_by_views(differing: Double) -> Double:
+    """(N,): how many times as far as those of the plainest of them the views of texels differ,
+    ``differing`` (N,), at least 1, as where that is not known (NaN). What looks another way from
+    each side mirrors, or mixes in a pixel what lies side by side: the middle of that is what a
+    plain reflector shows by chance alone."""
+    known = np.isfinite(differing)
+    plain = float(np.quantile(differing[known], _PLAINEST)) if known.any() else 0.0
+    return np.where(known, np.maximum(differing / max(plain, _LEAST_DIFFERING), 1), 1.0)
+
+
 _MOSTLY_INFERRED = calibration.number("outside.level_unknown")
 _OVER_ONE = calibration.number("outside.over_one")
 
 
-def levelled(asked: Asked, sources: Sources, found: Solution) -> Solution:
+def levelled(
+    asked: Asked, sources: Sources, found: Solution, differing: Callable[[], Double] | None = None
+) -> Solution:
     """The same, but where nearly all light is inferred: contrasts then leave its level and colour
     open. It is taken to be white as a whole, and as bright as it must be for hardly a texel to
-    reflect more than it receives."""
+    reflect more than it receives; those of objects that look another way from each side, as metals
+    do, tell less of that. differing: tells that of objects, as ``AssetMaps.differing``; None if
+    all are alike."""
     inferred = sources.irradiance(found.log_radiance)
     share = np.median(inferred.sum(axis=1) / (inferred + asked.irradiance).sum(axis=1))
     if share < _MOSTLY_INFERRED:
@@ -370,9 +388,11 @@ def levelled(asked: Asked, sources: Sources, found: Solution) -> Solution:
     reflected, inferred, known = (
         light[plain] for light in (asked.reflected, inferred * np.exp(shift), asked.irradiance)
     )
+    alike = np.ones(len(asked.owner)) if differing is None else differing()[asked.owner]
+    weight = doubt_by_views(alike[plain]) ** -2.0
     for factor in np.geomspace(1, _BRIGHTEST, _STEPS):
-        over = (reflected > known + factor * inferred).any(axis=1).mean()
-        if over < _OVER_ONE:
+        over = (reflected > known + factor * inferred).any(axis=1)
+        if weight @ over < _OVER_ONE * weight.sum():
             break
     shift = shift + np.log(factor)
     return found._replace(log_radiance=found.log_radiance + shift)

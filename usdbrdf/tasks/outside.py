@@ -50,7 +50,7 @@ def outside_of(
     lit, coverage = beside_panes(surface, maps.lit, maps.coverage)
     return estimated_outside(
         run, surface, maps.frames, lit, coverage, up_axis == "Z",
-        options.sampling.seed, said,
+        options.sampling.seed, said, lambda: maps.differing,
     )  # fmt: skip
 
 

@@ -30,7 +30,7 @@ from usdbrdf.transport.denoise import chosen_filter
 def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskResult:
     """Trace S, divide, find the emitters; write shading.usda, lights.usda and their maps."""
     # What was done is recorded, not "auto": with pyoidn newly installed, S is made again.
-    lightmap_filter = chosen_filter(options.denoise)
+    denoiser = chosen_filter(options.denoise)
     maps = AssetMaps(open_weaker(asset, "shading"))
     asked = directives_of(asset, maps.stage, OF_SHADE)
     inputs = hashes_of_inputs(
@@ -39,7 +39,7 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
     )  # fmt: skip
     parameters = {
         **asdict(options.sampling),
-        "denoise": lightmap_filter,
+        "denoise": denoiser,
         "environment": kind_of_light(options.environment),
         **({"directives": asked} if asked else {}),
     }
@@ -50,8 +50,8 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
         surface = with_panes(run, maps, options, task.header.up_axis, said)
         outside = outside_of(run, maps, surface, options, task.header.up_axis, said)
         # Where nothing is outside, what panes show is all that is known of the light behind them.
-        given = surface if outside else maps.surface, maps.lit, maps.coverage, maps.frames, outside
-        shaded = shade_surface(run, *given, options.sampling, lightmap_filter, said, maps.differing)
+        seen = surface if outside else maps.surface, maps.lit, maps.coverage, maps.frames, outside
+        shaded = shade_surface(run, *seen, options.sampling, denoiser, said, lambda: maps.differing)
         published = write_outside(run, asset, outside) if outside else None
         writer = MapWriter(run, asset, maps.scene, maps.texels)
         objects = [
@@ -73,7 +73,7 @@ def shade(asset: Asset, options: ShadeOptions, workers: Workers = HERE) -> TaskR
         view.write(run.output(asset.preview("albedo")), maps.texels, shaded.albedo, exposure=1)
         view.write(run.output(asset.preview("irradiance")), maps.texels, shaded.irradiance)
         doubts = warned(shaded.doubts(identifiers := [item.identifier for item in objects]))
-        summary = shaded.summary(identifiers) | {"denoise": lightmap_filter, "warnings": doubts}
+        summary = shaded.summary(identifiers) | {"denoise": denoiser, "warnings": doubts}
         return summary | ({"outside": published.summary} if published else {})
 
     return task.run(work, workers)
