@@ -9,6 +9,7 @@ from usdbrdf.shading.outside_light import (
     Solution,
     Sources,
     jackknife,
+    levelled,
     likeliest,
     pull_of_prior,
     solved,
@@ -166,3 +167,38 @@ def test_a_start_from_which_less_is_explained_changes_nothing():
     np.testing.assert_allclose(
         likeliest(asked, sources, far).log_radiance[0], np.log(1500), atol=0.05
     )
+
+
+def test_the_level_of_light_that_nobody_saw_follows_what_looks_alike_from_all_sides():
+    """In light of 1 four things reflect 0.2 to 1.2 of it: it is raised until the brightest would be
+    white. Metals beside them, three times as bright where they mirror a window, tell less."""
+    albedo = np.array([0.2, 0.4, 0.6, 1.2, 3, 3])
+    owner = np.repeat(np.arange(6, dtype=np.int32), EACH)
+    reflected = np.repeat(albedo[owner][:, None], 3, axis=1)
+    asked = Asked(
+        texel=np.arange(len(owner)),
+        segment=owner,
+        owner=owner,
+        reflected=reflected,
+        clipped=np.zeros(len(owner), np.bool_),
+        irradiance=np.full((len(owner), 3), 1e-9),
+        mirrored=0 * reflected,
+    )
+    sources = Sources(
+        share=np.ones((1, len(owner))),
+        mean=np.zeros((1, 3)),
+        deviation=np.ones(1),
+        family=np.zeros(1, np.int64),
+        pairs=np.zeros((0, 2), np.int64),
+        apart=np.zeros(0),
+    )
+    logs = np.log(albedo)[:, None] * np.ones(3)
+    found = Solution(np.zeros((1, 3)), logs, np.zeros(3), np.zeros((6, 3)))
+
+    def level(differing=None) -> float:
+        return float(np.exp(levelled(asked, sources, found, differing).log_radiance).mean())
+
+    mirrors = np.array([0.05] * 4 + [0.6] * 2)
+    assert abs(level(lambda: mirrors) - 1.2) < 0.05
+    assert abs(level() - 3) < 0.1
+    assert level(lambda: np.full(6, np.nan)) == level()
