@@ -6,11 +6,9 @@ that there is something in between to be killed, and differ in nothing else.
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -21,6 +19,7 @@ import usdbrdf.geometry.unwrap
 import usdbrdf.material.fit_objects
 import usdbrdf.shading.shaded
 import usdbrdf.texturing.lit_texture
+from tests.children import Program, started_program
 from tests.fault_injection import VARIABLE, inject
 from tests.scenes import make_capture
 from usdbrdf.cli import main
@@ -113,12 +112,8 @@ def command(name: str, base: Path, asset: Path) -> list[str]:
     return [name, "-q", *place, *options]
 
 
-def start(arguments: list[str], fault: str = "") -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *arguments],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), VARIABLE: fault},
-        stderr=subprocess.PIPE,
-    )
+def start(arguments: list[str], fault: str = "") -> Program | subprocess.Popen[bytes]:
+    return started_program(PROGRAM, arguments, {VARIABLE: fault})
 
 
 def killed_at(arguments: list[str], fault: str) -> None:

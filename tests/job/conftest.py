@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
+from tests.children import started_program
 from tests.fault_injection import VARIABLE
 from usdbrdf.files.atomic import sha256_of
 
 TOY = Path(__file__).with_name("toy_task.py")
-ROOT = Path(__file__).parents[2]
+_AS_SCRIPT = f"import runpy; runpy.run_path({str(TOY)!r}, run_name='__main__')"
 
 
 @pytest.fixture(scope="session")
@@ -30,15 +29,10 @@ def toy() -> ModuleType:
 @pytest.fixture(scope="session")
 def toy_process() -> Callable[..., subprocess.CompletedProcess[str]]:
     def run(asset: Path, *arguments: str, fault: str = "") -> subprocess.CompletedProcess[str]:
-        search = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-        return subprocess.run(
-            [sys.executable, str(TOY), str(asset), *arguments],
-            env={**os.environ, "PYTHONPATH": search, VARIABLE: fault},
-            capture_output=True,
-            text=True,
-            timeout=600,
-            check=False,
-        )
+        words = [str(asset), *arguments]
+        process = started_program(_AS_SCRIPT, words, {VARIABLE: fault})
+        out, err = process.communicate(timeout=600)
+        return subprocess.CompletedProcess(words, process.returncode, out.decode(), err.decode())
 
     return run
 

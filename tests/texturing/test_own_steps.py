@@ -18,11 +18,7 @@ from usdbrdf.tasks import registration
 from usdbrdf.tasks.agreement import Asked
 from usdbrdf.tasks.inspect import inspect
 from usdbrdf.texturing.registration.joint_change import Found
-from usdbrdf.texturing.registration.own_steps import (
-    OwnSteps,
-    own_steps_of_frames,
-    said_of_own_steps,
-)
+from usdbrdf.texturing.registration.own_steps import OwnSteps, said_of_own_steps
 from usdbrdf.texturing.registration.similarity import Similarity, SimilarityCheck
 from usdbrdf.transport.rays import RayScene
 
@@ -52,7 +48,7 @@ def _trembling(cameras, millimetres):
 def test_poses_that_are_off_each_by_itself_are_told(study, millimetres):
     mesh, rays, cameras, pictures = study
     trembling = _trembling(cameras, millimetres)
-    found = own_steps_of_frames(mesh, rays, trembling, pictures)
+    found = registration.own_steps_of_frames(mesh, rays, trembling, pictures)
     assert found.is_clear
     assert (found.moved > 0).mean() > 0.8
     asked = Asked(None, np.empty((0, len(cameras))), trembling, pictures)
@@ -97,11 +93,11 @@ def test_a_scale_of_poses_that_tremble_is_told(study):
 
 
 def test_poses_that_are_right_are_believed(study):
-    found = own_steps_of_frames(*study)
+    found = registration.own_steps_of_frames(*study)
     assert found.usual < 0.001
     assert not found.is_clear
     mesh, rays, cameras, pictures = study
-    assert own_steps_of_frames(mesh, rays, cameras[:5], pictures[:5]) is None
+    assert registration.own_steps_of_frames(mesh, rays, cameras[:5], pictures[:5]) is None
 
 
 def test_what_is_told_is_how_far_the_usual_frame_is_moved():

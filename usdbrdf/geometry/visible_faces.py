@@ -21,8 +21,9 @@ Vector = tuple[float, float, float]
 # Rays decide within this many pixels of an edge, and where two depths differ by less than this
 # share: single precision, in which rays are traced, errs by a tenth of both.
 _EDGE, _DEPTH = 4e-3, 2e-5
-# Bands of rows, drawn in any order by any thread.
-_BANDS = 32
+# Bands of rows, drawn in any order by any thread, at most; a power of two. Each asks all triangles,
+# which takes longer than to draw what small pictures show of them: so many rows has each at least.
+_BANDS, _LEAST_ROWS = 32, 16
 _BEHIND = 1e-9
 
 
@@ -76,11 +77,19 @@ def visible_faces(rays: RayScene, camera: Camera) -> tuple[Int, Float]:
     picture = _Picture(
         np.full(size, -1, np.int32), np.zeros(size, np.float32), np.zeros(size, np.float32)
     )
-    _draw(_BANDS, mesh, faces[kept], rows[kept], pinhole, picture)
+    bands = _bands(camera.height)
+    _draw(bands, bands, mesh, faces[kept], rows[kept], pinhole, picture)
     point = np.empty((*size, 3), np.float32)
     _points(len(point), pinhole, picture.nearness, point)
     _trace_doubtful(rays, camera, picture, point)
     return picture.face, point
+
+
+def _bands(height: int) -> int:
+    bands = _BANDS
+    while bands > 1 and height < bands * _LEAST_ROWS:
+        bands //= 2
+    return bands
 
 
 def _trace_doubtful(rays: RayScene, camera: Camera, picture: _Picture, point: Float) -> None:
@@ -184,14 +193,15 @@ def _corners(mesh: _Mesh, f: int, camera: _Pinhole) -> tuple[Vector, Vector, Vec
 
 @parallel_kernel
 def _draw(
-    first: int, last: int, mesh: _Mesh, faces: Int, rows: Int, camera: _Pinhole, picture: _Picture
-) -> None:
+    first: int, last: int, bands: int, mesh: _Mesh, faces: Int, rows: Int, camera: _Pinhole,
+    picture: _Picture,
+) -> None:  # fmt: skip
     height = camera.height
     for i in range(first, last):
         # Neighbouring bands, which are similarly full, go to different threads.
-        band = i * 13 % _BANDS
-        low = band * height // _BANDS
-        high = (band + 1) * height // _BANDS
+        band = i * 13 % bands
+        low = band * height // bands
+        high = (band + 1) * height // bands
         for j in range(len(faces)):
             if rows[j, 0] < high and rows[j, 1] >= low:
                 _draw_face(mesh, faces[j], low, high, camera, picture)

@@ -18,6 +18,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.geometry.visible_faces import visible_faces
+from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh, across_triangles
@@ -319,20 +320,35 @@ def _shown(
     return _Samples(*(column[known] for column in of_all))
 
 
-def _without_means(samples: _Samples, column: Double, weight: Double) -> Double:
-    """(S,) less what the samples of a point, and of a patch, have in common."""
-    left = column
+def _without_means(samples: _Samples, columns: Double, weight: Double) -> Double:
+    """(S, C) less what the samples of a point, and of a patch, have in common."""
+    left = columns.copy()
     kinds = (samples.patch, samples.point)
     weights = [np.maximum(np.bincount(own, weight), 1e-9) for own in kinds]
     for _ in range(_TURNS):
         for own, of_all in zip(kinds, weights, strict=True):
-            left = left - (np.bincount(own, weight * left) / of_all)[own]
+            _take_means(own, weight, of_all, left)
     return left
+
+
+@loop
+def _take_means(own: Long, weight: Double, of_all: Double, left: Double) -> None:
+    """Off each column what the samples of each number ``own`` have in common."""
+    means = np.zeros((len(of_all), left.shape[1]))
+    for s in range(len(left)):
+        for c in range(left.shape[1]):
+            means[own[s], c] += weight[s] * left[s, c]
+    for i in range(len(of_all)):
+        for c in range(left.shape[1]):
+            means[i, c] /= of_all[i]
+    for s in range(len(left)):
+        for c in range(left.shape[1]):
+            left[s, c] -= means[own[s], c]
 
 
 def _off(samples: _Samples) -> Double:
     """(S,) what each sample differs from the others of its point by."""
-    left = _without_means(samples, samples.value, np.ones(len(samples.value)))
+    left = _without_means(samples, samples.value[:, None], np.ones(len(samples.value)))[:, 0]
     number = np.bincount(samples.point)[samples.point]
     return left * np.sqrt(number / (number - 1))
 
@@ -353,9 +369,10 @@ def _step(samples: _Samples) -> tuple[Double, Double]:
     from how far the frames agree on it."""
     weight: Double = np.ones(len(samples.value))
     tie = 1e-9 * np.eye(samples.slope.shape[1])
+    columns = np.column_stack([samples.value, samples.slope])
     for _ in range(_ROUNDS):
-        off = _without_means(samples, samples.value, weight)
-        basis = np.stack([_without_means(samples, c, weight) for c in samples.slope.T], axis=1)
+        known = _without_means(samples, columns, weight)
+        off, basis = known[:, 0], np.ascontiguousarray(known[:, 1:])
         normal = (basis * weight[:, None]).T @ basis + tie
         step = -np.linalg.solve(normal, basis.T @ (weight * off))
         left = off + basis @ step
