@@ -116,7 +116,7 @@ def test_images_come_in_the_order_of_their_whole_names(tmp_path, text):
         file = made.folder / "sparse/0/images.txt"
         rows = [row for row in file.read_text().splitlines() if row[:1] != "#"]
         pairs = [rows[k : k + 2] for k in range(0, len(rows), 2)]
-        file.write_text("\n".join(row for pair in pairs[::-1] for row in pair) + "\n")
+        file.write_text("\n".join(row for pair in pairs[::2] + pairs[1::2] for row in pair) + "\n")
     scan = read_scan(made.folder, OPTIONS)
     assert [path.name for path in scan.frames.image_paths] == names
     np.testing.assert_allclose(scan.frames.world_from_camera, made.world_from_camera, atol=1e-9)
