@@ -164,6 +164,7 @@ ENGINEERING: dict[str, str] = {
     "FEWEST": "samples that a statistic needs",
     "FINEST": "pixels of a picture",
     "FIRST_RAYS": "rays: noise against time",
+    "FLIPS": "mathematics: signs of axes",
     "GLIMPSE": "codes of what a texel shows in a frame",
     "GRID": "discretisation of the search",
     "HEIGHT": "pixels of a picture",

@@ -491,7 +491,9 @@ def test_png_of_16_bits_is_linear_if_that_is_stated(made):
     _rename(made, "photographs/{:04d}.png")
     with pytest.raises(InputRefused, match=r"PNG.*--input-space.*\[capture\.ldr\]$"):
         _read(made)
-    assert not _read(made, assume_srgb=True).frames.radiometric
+    taken = _read(made, assume_srgb=True)
+    assert not taken.frames.radiometric
+    assert not any("8-bit" in sentence for sentence in taken.warnings)
     frames = _read(made, encoding="lin_rec709_scene").frames
     assert (frames.radiometric, frames.encoding) == (True, "lin_rec709_scene")
     shown = read_frame(frames, 3)

@@ -628,8 +628,10 @@ def test_unusable_files_are_refused_in_one_sentence(tmp_path, name, content, rul
 
 @pytest.mark.fault("G8")
 def test_georeferenced_points_that_single_precision_would_move_are_refused(tmp_path):
-    """At 600 km steps are of 6 cm; in a mesh of 4 km they say nothing."""
-    for size, place, refused in ((4, 0, False), (4, 6e5, True), (4000, 6e5, False)):
+    """At 600 km steps are of 6 cm; in a mesh of 4 km they say nothing. Northings of UTM are farther
+    away, and their cure is the same: cameras come along."""
+    cases = ((4, 0, False), (4, 6e5, True), (4000, 6e5, False), (4, 5.4e6, True))
+    for size, place, refused in cases:
         x, y = place, place / 3
         corners = [(x, y), (x + size, y), (x + size, y + size)]
         rows = "".join(f"v {p:.3f} {q:.3f} 400\n" for p, q in corners)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from usdbrdf.capture.checks import Findings
 from usdbrdf.errors import InputRefused
 from usdbrdf.model.arrays import Double
+from usdbrdf.model.camera import Camera
 
 # OpenCV's camera (y down, looking down +z) has OpenGL's second and third axis reversed.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -122,6 +124,32 @@ def _of_units() -> dict[str, Callable[[Double], Double]]:
 # And of units, of which hits alone do not tell: from one point in a room everything is hit, and
 # cameras around a thing hit it more the nearer they are.
 UNITS = _of_units()
+# And of pixels whose rows or columns run the other way than the cameras saw them: 1, or -1 of what
+# is reversed, x and y. No pose undoes the first two.
+FLIPS = {
+    "upside down, as written from the last row to the first (reverse their rows)": (1, -1),
+    "mirrored from left to right (reverse their columns)": (-1, 1),
+    "turned by 180 degrees (turn them back)": (-1, -1),
+}
+
+
+def with_reversed_pixels(camera: Camera, name: str) -> Camera:
+    """What projects to the pixels of its picture if they are one of ``FLIPS``; of any other name
+    the camera itself. A mirrored one is no camera that can be, but as good to look points up by."""
+    if name not in FLIPS:
+        return camera
+    x, y = FLIPS[name]
+    fx, fy, cx, cy = camera.intrinsics
+    return replace(
+        camera,
+        world_from_camera=camera.world_from_camera @ np.diag([x, y, 1.0, 1.0]),
+        intrinsics=(
+            fx,
+            fy,
+            cx if x > 0 else camera.width - cx,
+            cy if y > 0 else camera.height - cy,
+        ),
+    )
 
 
 def _stated(holder: Mapping[str, Any]) -> dict[str, str]:

@@ -464,7 +464,7 @@ def as_photographs(
                 "ISO speed alike: they pass for equally exposed."
             )
     findings.warn(
-        f"{source.name}: the images are 8-bit sRGB photographs, so the result is not radiometric: "
+        f"{source.name}: the images are photographs, so the result is not radiometric: "
         f"colours and relative brightness only.{told} [capture.ldr]"
     )
     for doubt in doubts_about_headers(records, source, exposures_are_stated=stated):

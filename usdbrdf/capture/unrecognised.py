@@ -278,9 +278,9 @@ def of_record3d(metadata: Path) -> bool:
     """Whether a file of this name is Record3D's: others call theirs so too, and its keys have no
     order."""
     from usdbrdf.files.documents import read_text
-    from usdbrdf.files.tables import beginning_of
+    from usdbrdf.files.tables import beginning_in_utf8
 
-    if beginning_of(metadata).lstrip()[:1] != b"{":
+    if beginning_in_utf8(metadata).lstrip()[:1] != b"{":
         return False
     with suppress(InputRefused):
         said = read_text(metadata)

@@ -61,6 +61,11 @@ def beginning_of_text(path: Path) -> str:
     return head.decode(encoding_of_text(head), "replace")
 
 
+def beginning_in_utf8(path: Path) -> bytes:
+    """The same as bytes of UTF-8 without a mark, for what is known by how it begins."""
+    return beginning_of_text(path).encode()
+
+
 def number_rows(path: Path, *, most: int | None = None) -> tuple[Double, ...]:
     """Each line's numbers, (n,) float64, separated by blanks or commas; lines without any, and
     what follows a #, are passed over. NaN and infinities are for the caller to judge.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.capture.checks import spread_evenly
-from usdbrdf.capture.conventions import CONVENTIONS, UNITS
+from usdbrdf.capture.conventions import CONVENTIONS, FLIPS, UNITS, with_reversed_pixels
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.frames import Read, read_frames
 from usdbrdf.job.progress import progress
@@ -42,7 +42,7 @@ _SHIFTED = {
     f"those of the frames {abs(by)} {'after' if by > 0 else 'before'} them in the list": by
     for by in (1, -1, 2, -2)
 }
-_READINGS = (*_CONVERTED, *_SHIFTED)
+_READINGS = (*_CONVERTED, *_SHIFTED, *FLIPS)
 # Of the points every so many are looked up under other readings at first.
 _STRIDE = 4
 
@@ -80,9 +80,10 @@ def agreement_of_frames(
     pictures: dict[int, Float] = {}
     poses, numbers = of_all or (frames.world_from_camera, range(len(frames)))
 
-    def read_as(name: str, i: int) -> Double:
+    def read_as(name: str, i: int) -> Camera:
         own = (numbers[i] + _SHIFTED.get(name, 0)) % len(poses)
-        return _CONVERTED.get(name, _CONVERTED[_AS_GIVEN])(poses[own])
+        pose = _CONVERTED.get(name, _CONVERTED[_AS_GIVEN])(poses[own])
+        return with_reversed_pixels(replace(frames.camera(i), world_from_camera=pose), name)
 
     def looked_up(steps: Mapping[str, int]) -> dict[str, Float]:
         """What the frames show, under some readings, at every so many points."""
@@ -90,12 +91,10 @@ def agreement_of_frames(
         found: dict[str, list[Float]] = {name: [] for name in steps}
         images = read_frames(read, asked)
         for i, pixels in progress(images, total=len(asked), label="agreement", unit="frames"):
-            camera = frames.camera(i)
             if i not in pictures:  # which are halved further where the frames' sizes differ
                 pictures[i] = logarithms(pixels, max(1, pixels.valid.shape[1] // (2 * FINEST)))
             for name, step in steps.items():
-                other = replace(camera, world_from_camera=read_as(name, i))
-                found[name].append(logarithms_in_frame(some[step], rays, other, pixels))
+                found[name].append(logarithms_in_frame(some[step], rays, read_as(name, i), pixels))
         return {name: np.stack(columns, axis=1) for name, columns in found.items()}
 
     # Under wrong readings frames may agree as well, where most of a scene is one colour; but less.
@@ -112,9 +111,10 @@ def agreement_of_frames(
     if better is not None:
         differ = f"differ by {given.ratio:.0%} of what any two pixels do" if given else "share none"
         cure = "Pair frames and poses anew" if name in _SHIFTED else "Convert the poses"
+        what, cure = ("frames", "Save the frames anew") if name in FLIPS else ("poses", cure)
         raise InputRefused(
             f"{source}: the frames do not show the same things at the same points of the mesh "
-            f"({differ}); with the poses read as {name} they would differ by {better.ratio:.0%}. "
+            f"({differ}); with the {what} read as {name} they would differ by {better.ratio:.0%}. "
             f"{cure}. [capture.convention]"
         )
     return Asked(given, rows, cameras, [*pictures.values()])

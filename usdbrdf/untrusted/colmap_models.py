@@ -119,10 +119,11 @@ def read_here(images: Path) -> ColmapModel:
         (scratch / f"points3D{images.suffix}").write_bytes(no_points)
         try:
             model = pycolmap.Reconstruction(str(scratch))
-            found = sorted(
-                (image for image in model.images.values() if image.has_pose), key=lambda i: i.name
-            )
-            names = _whole_names(images, {i.image_id: str(i.name) for i in found})
+            posed = {i.image_id: i for i in model.images.values() if i.has_pose}
+            # By whole names: of one first word, as of "IMG (1).jpg" on, COLMAP knows no order.
+            called = _whole_names(images, {n: str(image.name) for n, image in posed.items()})
+            numbers = sorted(called, key=lambda n: called[n])
+            names, found = tuple(called[n] for n in numbers), [posed[n] for n in numbers]
             poses = [_camera_from_world(image.cam_from_world()) for image in found]
         # COLMAP says what it stumbles over in its own terms, by exceptions of several kinds.
         except Exception as error:
@@ -185,12 +186,12 @@ def _is_points(said: str) -> bool:
     return len(words) % 3 == 0 and all(_NUMBER.fullmatch(word) for word in words)
 
 
-def _whole_names(images: Path, known: dict[int, str]) -> tuple[str, ...]:
-    """The images' names by their numbers, in the order of ``known``. In a text model a name goes on
-    to the end of its line; COLMAP itself reads it up to the first space."""
-    if images.suffix != ".txt":
-        return tuple(known.values())
+def _whole_names(images: Path, known: dict[int, str]) -> dict[int, str]:
+    """The images' names by their numbers, of which ``known`` are. In a text model a name goes on to
+    the end of its line; COLMAP itself reads it up to the first space."""
     whole = dict(known)
+    if images.suffix != ".txt":
+        return whole
     with images.open(encoding="utf-8-sig", errors="replace") as lines:
         for line in lines:
             # Number, pose (7) and camera, before the name; points are rows of numbers alone.
@@ -199,7 +200,7 @@ def _whole_names(images: Path, known: dict[int, str]) -> tuple[str, ...]:
                 number, name = int(said[0]), said[9]
                 if number in known and name.split()[0] == known[number]:
                     whole[number] = name
-    return tuple(whole.values())
+    return whole
 
 
 def _refuse_promises(file: Path) -> None:

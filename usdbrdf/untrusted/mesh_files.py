@@ -171,10 +171,11 @@ def checked_mesh(mesh: FileMesh, path: Path) -> FileMesh:
     _refuse_if_many(path, inside & ~whole, "have NaN or infinite corners", "mesh.nonfinite")
     triangles = mesh.triangles[whole]
     used = mesh.points[np.unique(triangles)].astype(np.float64)
+    refuse_far(path, used)
     if np.abs(used).max() > _MAX_COORDINATE:
         raise InputRefused(
             f"{path}: coordinates reach {np.abs(used).max():.3g} (limit {_MAX_COORDINATE:g}). "
-            "Move the scan to the origin, or check its unit. [mesh.far]"
+            "Export mesh and cameras near the origin, or check the unit. [mesh.far]"
         )
     diagonal = float(np.linalg.norm(np.ptp(used, axis=0)))
     if diagonal < _MIN_DIAGONAL:
@@ -182,7 +183,6 @@ def checked_mesh(mesh: FileMesh, path: Path) -> FileMesh:
             f"{path}: the whole mesh is {diagonal:.3g} across (limit {_MIN_DIAGONAL:g}). "
             "Check its unit. [mesh.tiny]"
         )
-    refuse_far(path, used)
     return replace(
         mesh,
         # Vertices of no face keep their place, but no NaN may travel on.

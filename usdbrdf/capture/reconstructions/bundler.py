@@ -25,7 +25,7 @@ from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
 from usdbrdf.files.paths import seen_of
-from usdbrdf.files.tables import beginning_of, files_of, number_rows
+from usdbrdf.files.tables import beginning_in_utf8, files_of, number_rows
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens
@@ -55,7 +55,7 @@ def _documents(path: Path) -> list[Path]:
     found = [
         file
         for file in files_of(path, [".out"]) + files_of(path / _FOLDER, [".out"])
-        if (said := begun.match(beginning_of(file)))
+        if (said := begun.match(beginning_in_utf8(file)))
         and (b"#" in said[0] or file.name == "bundle.out")
     ]
     return sorted(found, key=lambda file: (file.name != "bundle.out", file.name))

@@ -24,7 +24,7 @@ from usdbrdf.capture.reconstructions.shots import (
 from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
-from usdbrdf.files.tables import beginning_of, files_of, numbers_among, only_one
+from usdbrdf.files.tables import beginning_in_utf8, files_of, numbers_among, only_one
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens
 from usdbrdf.options import CaptureOptions
@@ -49,7 +49,7 @@ def matches(path: Path) -> bool:
 
 def _documents(path: Path) -> list[Path]:
     files = files_of(path, [".txt"]) + files_of(path / _PLACE, [".txt"])
-    return [file for file in files if beginning_of(file).lstrip().startswith(_HEAD)]
+    return [file for file in files if beginning_in_utf8(file).lstrip().startswith(_HEAD)]
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:

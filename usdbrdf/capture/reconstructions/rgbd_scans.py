@@ -50,7 +50,7 @@ from usdbrdf.files.documents import read_json, read_text
 from usdbrdf.files.images import image_size
 from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import (
-    beginning_of,
+    beginning_in_utf8,
     csv_rows,
     files_of,
     number_in,
@@ -223,7 +223,7 @@ def _of_record3d(
 
 def _table(path: Path) -> list[Path]:
     found = _named_or_in(path, _TABLE)
-    return [file for file in found if re.match(STRAY_TABLE, beginning_of(file))]
+    return [file for file in found if re.match(STRAY_TABLE, beginning_in_utf8(file))]
 
 
 def _of_stray_scanner(
@@ -269,7 +269,7 @@ def _of_open3d(path: Path) -> list[Path]:
     if len(stages) == 1 and stages[0].stem.lower() != "mesh":
         return []
     found = _named_or_in(path, "*.json", *_LOGS, *(f"scene/{log}" for log in _LOGS), "scene/*.json")
-    heads = {file: beginning_of(file) for file in found}
+    heads = {file: beginning_in_utf8(file) for file in found}
     whole = [f for f in found if b'"PinholeCameraTrajectory"' in heads[f]] or [
         f for f in found if f.suffix != ".json" and re.match(OPEN3D_LOG, heads[f])
     ]
@@ -355,7 +355,7 @@ def _lens_beside(
     for file in sorted(places, key=lambda file: "intrinsic" not in file.name.lower()):
         if found and "intrinsic" not in file.name.lower():
             break
-        head = beginning_of(file)
+        head = beginning_in_utf8(file)
         is_lens = b'"intrinsic_matrix"' in head and b'"PinholeCameraParameters"' not in head
         if is_lens and (lens := _stated(_object(read_json(file)))):
             found.setdefault(lens, file)
@@ -434,7 +434,7 @@ def _lens_of_matterport(file: Path) -> ShotCamera | None:
 
 def _configuration(path: Path) -> list[Path]:
     found = _named_or_in(path, f"{_DOCUMENTS[1]}/*.conf", "*.conf")
-    return [file for file in found if re.search(OF_MATTERPORT, beginning_of(file))][:1]
+    return [file for file in found if re.search(OF_MATTERPORT, beginning_in_utf8(file))][:1]
 
 
 def _of_configuration(

@@ -19,7 +19,7 @@ from usdbrdf.capture.reconstructions.shots import CentredCamera, Shot, scan_of_s
 from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.documents import read_text
-from usdbrdf.files.tables import beginning_of, files_of, numbers_among, only_one
+from usdbrdf.files.tables import beginning_in_utf8, files_of, numbers_among, only_one
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import Lens
 from usdbrdf.options import CaptureOptions
@@ -37,7 +37,7 @@ def matches(path: Path) -> bool:
 
 
 def _documents(path: Path) -> list[Path]:
-    return [f for f in files_of(path, [".nvm"]) if beginning_of(f).lstrip().startswith(_HEAD)]
+    return [f for f in files_of(path, [".nvm"]) if beginning_in_utf8(f).lstrip().startswith(_HEAD)]
 
 
 def read(path: Path, options: CaptureOptions) -> Scan:
