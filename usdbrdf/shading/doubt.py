@@ -75,7 +75,7 @@ def shines_evenly(
     for i in range(len(found)):
         own = texels.of_object(i)
         some = told[own]
-        if not some.any():
+        if not texels.area[own][some].any():
             continue
         area = texels.area[own][some].astype(np.float64)
         of_noise = float(np.average(noise[own][some] ** 2, weights=area))
