@@ -147,6 +147,17 @@ def test_a_metal_in_light_that_is_known_badly_is_found_by_what_changes_with_the_
     assert conductor_of(plain, TEXEL, light, (basis(2), basis(3)), dielectric) is None
 
 
+@pytest.mark.parametrize("dark", [2.0, 3.0])
+def test_a_varnished_pattern_in_light_that_is_told_too_dark_is_no_metal(dark: float):
+    """A diffuse part of each texel passes for what a metal's mirrors that is not known, but does
+    not change with the view."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        pattern = np.exp(0.5 * rng.standard_normal((TEXELS, 1)))[TEXEL] * [1.0, 1.0, 0.9]
+        radiance = 0.25 * pattern + 0.05 * dark * _incident(1)
+        assert _found(radiance.astype(np.float32), 1.0) is None
+
+
 def test_a_lamp_that_rays_find_and_the_frame_does_not_show_is_no_evidence():
     """Its ray outweighs all others of the mirror in a sum of squares."""
     radiance = ((0.01 + F0) * _incident(1)).astype(np.float32)

@@ -74,32 +74,69 @@ def test_what_exceeds_light_that_is_known_badly_is_no_emitter(world: World, lit:
     assert found(np.inf).is_lamp[2]
 
 
-def test_what_does_not_follow_the_light_on_it_shines_however_badly_that_is_known(
-    world: World, lit: np.ndarray
-):
-    own = np.flatnonzero(world.texels.object_index() == 2)
+PANEL = 2
+
+
+@pytest.fixture
+def panel(world: World, lit: np.ndarray):
+    """What is asked of a wall, half of which has twice as much light as the other half: whether it
+    counts as even, and as a lamp where lamps are known badly."""
+    own = np.flatnonzero(world.texels.object_index() == PANEL)
     shading = np.full_like(lit, SHADING)
-    # As a panel beside a lamp: half of it has twice as much light as the other half.
     shading[own[: len(own) // 2]] *= 2
-    noise, everywhere = 0.05 * shading, np.ones(len(lit), bool)
-    lit[own] = 1.5 * 2 * SHADING / np.pi
-    measured = world.texels, lit, shading
+    everywhere = np.ones(len(lit), bool)
 
-    def is_lamp(error=noise, seen=everywhere):
-        even = shines_evenly(*measured, error, seen)
-        doubt = np.where(even, 0, 0.6)
-        return even[2], find_emitters(*measured, seen, ~everywhere, doubt=doubt).is_lamp[2]
+    def asked(shown, shading=shading, error=None, seen=everywhere):
+        radiance = lit.copy()
+        radiance[own] = shown
+        measured = world.texels, radiance, shading
+        even = shines_evenly(*measured, 0.05 * shading if error is None else error, seen)
+        assert not even[[0, 1, 3, 4, 5, LAMP]].any()
+        doubts = {"doubt": 0.6, "doubt_of_whole": np.where(even, 0, 0.6)}
+        found = find_emitters(*measured, seen, ~everywhere, **doubts)
+        return bool(even[PANEL]), bool(found.is_lamp[PANEL]), int(found.emissive[own].sum())
 
-    assert is_lamp() == (True, True)
-    assert not shines_evenly(*measured, noise, everywhere)[[0, 1, 3, 4, 5, LAMP]].any()
-    # Noise of S that large makes a pattern like it of any wall.
-    assert is_lamp(error=0.5 * shading) == (False, False)
-    assert is_lamp(seen=~np.isin(np.arange(len(lit)), own)) == (False, False)
-    # A reflector follows, and paint of two kinds does not cancel it.
-    lit[own] = 1.5 * shading[own] / np.pi
-    assert is_lamp() == (False, False)
-    lit[own[::3]] *= 0.7
-    assert is_lamp() == (False, False)
+    return asked, own, shading
+
+
+def test_what_does_not_follow_the_light_on_it_shines_however_badly_that_is_known(panel):
+    asked, own, shading = panel
+    bright = 1.5 * 2 * SHADING / np.pi
+    assert asked(bright) == (True, True, len(own))
+    assert asked(bright, seen=~np.isin(np.arange(len(shading)), own))[:2] == (False, False)
+    # Noise of S as large makes a pattern like it of any wall.
+    assert asked(bright, error=0.27 * shading)[:2] == (False, False)
+    assert asked(bright, error=0.2 * shading)[:2] == (True, True)
+    # What sends no more than it could reflect does not shine, in whole or in part.
+    dim = np.full((len(own), 3), 0.8 * SHADING / np.pi)
+    assert asked(dim) == (True, False, 0)
+
+
+def test_a_reflector_follows_the_light_on_it(panel):
+    asked, own, shading = panel
+    shown = 1.5 * shading[own] / np.pi
+    assert asked(shown) == (False, False, 0)
+    # Paint of two kinds does not cancel it.
+    shown[::3] *= 0.7
+    assert asked(shown) == (False, False, 0)
+    # Where an even lamp is told too weak, S varies more than what is seen of it, which follows.
+    weakly = 1.5 * 2 * SHADING / np.pi * (shading[own] / shading[own].max()) ** 0.25
+    assert asked(weakly)[:2] == (False, False)
+
+
+@pytest.mark.parametrize(("share", "dark"), [(0.02, 1e-3), (0.04, 0.02)])
+def test_a_rim_without_light_makes_no_lamp_of_a_wall(panel, share: float, dark: float):
+    asked, own, _ = panel
+    shading = np.full((own.max() + 1 + 4096, 3), SHADING)[: len(panel[2])]
+    shading[own[: round(share * len(own))]] *= dark
+    assert asked(1.5 * SHADING / np.pi, shading)[:2] == (False, False)
+
+
+def test_light_that_does_not_vary_tells_nothing(panel):
+    asked, own, shading = panel
+    level = np.full_like(shading, SHADING)
+    level[own[0]] *= 1 + 1e-6
+    assert asked(1.5 * SHADING / np.pi, level, 0 * level)[:2] == (False, False)
 
 
 def test_the_inside_of_a_bulb_which_no_frame_shows_does_not_keep_it_from_being_a_lamp(

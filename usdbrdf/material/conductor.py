@@ -19,7 +19,7 @@ import numpy as np
 from usdbrdf import calibration
 from usdbrdf.material.fit_lobe import OfPhis
 from usdbrdf.material.verdict import LobeEstimate
-from usdbrdf.model.arrays import Double, Float, Long
+from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.transport.brdf import F0_OF_PSI
 
 _PHIS = calibration.numbers("conductor.roughnesses")
@@ -29,6 +29,9 @@ _MODEL_ERROR = calibration.number("conductor.model_error")
 _LEAST_ERROR = calibration.number("conductor.least_error")
 # Of a sample, relative: what is further off is no more against a model than this.
 _FURTHEST = calibration.number("conductor.furthest")
+# Of its reflectance what changes with the view tells of a metal at least; and how many times as
+# bright as the light that is known a texel's may be.
+_OF_CHANGES, _BRIGHTER = calibration.pair("conductor.of_changes")
 # Reflectances from which the search for one begins.
 _STARTS = (0.1, 0.3, 0.5, 0.7, 0.9)
 
@@ -84,13 +87,21 @@ def conductor_of(
     one, other = ((base + psi * slope)[..., 0] for base, slope in found)
     diffuse = irradiance / np.pi / level
     albedo = _least_squares(seen, (one, other), (diffuse, diffuse))
+    rests = [seen - part - albedo * diffuse for part in (one, other)]
+    of_rival = _log_error(rests, [_without_means(rest, texel, views) for rest in rests], views)
     of_best = [(base[..., best], slope[..., best]) for base, slope in lobes]
-    of_metal = [seen - base - f0 * slope for base, slope in of_best]
-    of_rival = [seen - part - albedo * diffuse for part in (one, other)]
-    clearer = _log_error(of_rival, texel) - _log_error(of_metal, texel)
-    if clearer < _CLEARER and not certain:
+    models = [base + f0 * slope for base, slope in of_best]
+    scale = _scale_of_texels(seen, models, texel, count)[texel]
+    of_metal = _log_error(
+        [seen - model for model in models], [seen - scale * model for model in models], views
+    )
+    clearer = of_rival - of_metal
+    # A diffuse part passes for that of a metal whose light is told too dark, and changes not.
+    changing = _of_changes(seen, of_best, models, texel, views)
+    f0, scatter = _median_of_texels(seen, of_best, models, texel)
+    told = clearer >= _CLEARER and changing.mean() >= max(_OF_CHANGES * f0.mean(), _LEAST_F0)
+    if not told and not certain:
         return None
-    f0 = _median_of_texels(seen, of_best, f0, texel)
     likely = np.exp(-0.5 * count * (np.log(errors / errors[best])))
     likely *= np.gradient(np.array(_PHIS))
     likely /= likely.sum()
@@ -102,7 +113,9 @@ def conductor_of(
         # The grid's step and what the model lacks are errors too.
         phi_error=math.hypot(phi_error, float(np.gradient(np.array(_PHIS))[best]) / 2),
         f0_error=math.hypot(
-            math.sqrt(float((likely @ (reflectances - f0) ** 2).mean())), _MODEL_ERROR
+            math.sqrt(float((likely @ (reflectances - reflectances[best]) ** 2).mean())),
+            float(scatter.mean()),
+            _MODEL_ERROR,
         ),
         clearer=clearer,
     )
@@ -137,43 +150,73 @@ def _least_squares(
 
 
 def _median_of_texels(
-    seen: Double, lobes: list[tuple[Double, Double]], f0: Double, texel: Long
-) -> Double:
-    """The reflectance (3,) in [0, 1] that half of the texels show more than, with ``f0`` (3,) by
-    least squares as a start: errors of the light that a texel mirrors, the same in all views, are
-    errors of the slope, and make that too small."""
-    base, slope = (sum(parts) / 2 for parts in zip(*lobes, strict=True))
-    used = np.abs(seen - base - f0 * slope) < _FURTHEST
+    seen: Double, lobes: list[tuple[Double, Double]], models: list[Double], texel: Long
+) -> tuple[Double, Double]:
+    """The reflectance (3,) in [0, 1] that half of the texels show more than, and its standard error
+    by their scatter; samples as far from the ``models`` as counts are left out. Errors of the light
+    that a texel mirrors, the same in all views, make that of least squares too small."""
+    base, slope = ((one + other) / 2 for one, other in zip(*lobes, strict=True))
+    used = np.abs(seen - (models[0] + models[1]) / 2) < _FURTHEST
     count = int(texel.max()) + 1
-    shown, mirrored = (
-        np.stack([np.bincount(texel, channel, count) for channel in (used * values).T], axis=-1)
-        for values in (seen - base, slope)
+    shown = _sums(used * (seen - base), texel, count)
+    mirrored = _sums(used * slope, texel, count)
+    told = (mirrored > 1e-9 * mirrored.max()).all(axis=1)
+    if not told.any():
+        return np.zeros(3), np.ones(3)
+    each = shown[told] / mirrored[told]
+    middle = np.median(each, axis=0)
+    # The standard error of a median is 1.25 times that of a mean.
+    scatter = 1.25 * 1.4826 * np.median(np.abs(each - middle), axis=0) / math.sqrt(len(each))
+    return np.asarray(np.clip(middle, 0, 1), np.float64), scatter
+
+
+def _scale_of_texels(seen: Double, models: list[Double], texel: Long, count: int) -> Double:
+    """(T, 3): how many times as bright as the models say a texel is in all views."""
+    one, other = models
+    squares = _sums(one * other, texel, count)
+    known = squares > 1e-9 * squares.max()
+    product = _sums(seen * (one + other) / 2, texel, count)
+    return np.where(known, np.clip(product / np.where(known, squares, 1), 0, _BRIGHTER), 1)
+
+
+def _of_changes(
+    seen: Double, lobes: list[tuple[Double, Double]], models: list[Double], texel: Long, views: Long
+) -> Double:
+    """The reflectance (3,) by what changes with the view alone."""
+    used = np.abs(seen - (models[0] + models[1]) / 2) < _FURTHEST
+    number = np.maximum(_sums(used, texel, len(views)), 1)
+
+    def change(values: Double) -> Double:
+        return used * (values - (_sums(used * values, texel, len(views)) / number)[texel])
+
+    (one, of_one), (other, of_other) = (
+        (change(seen - base), change(slope)) for base, slope in lobes
     )
-    told = mirrored > 1e-9 * mirrored.max()
-    found = [
-        np.median(shown[own, c] / mirrored[own, c]) if own.any() else f0[c]
-        for c, own in enumerate(told.T)
-    ]
-    return np.asarray(np.clip(found, 0, 1), np.float64)
+    product = (one * of_other + other * of_one).sum(axis=0) / 2
+    squares = (of_one * of_other).sum(axis=0)
+    return np.where(squares > 0, product / np.where(squares > 0, squares, 1), 0)
 
 
-def _log_error(rests: list[Double], texel: Long) -> float:
+def _sums(values: Double | Bool, texel: Long, count: int) -> Double:
+    """(T, 3) over the views of each texel."""
+    return np.stack([np.bincount(texel, channel, count) for channel in values.T], axis=-1)
+
+
+def _log_error(rests: list[Double], freed: list[Double], views: Long) -> float:
     """ln of the size of the errors, (P, 3) by two predictions with independent noise, that a model
-    leaves of samples; where that explains more, of the model in which each texel is off by a value
-    of its own in all views: a diffuse part besides, or what is wrong with the light it mirrors."""
-    uniform, views = _size(*rests), np.bincount(texel)
-    share = len(views) / len(texel)
-    # Each texel's own mean takes its share of the errors with it, and was before about as far from
+    of one value leaves of samples; or, where that explains more, of the model in which each of the
+    texels, that so many ``views`` show, has a value of its own, which leaves what is ``freed``: a
+    diffuse part, or how bright the light that it mirrors is."""
+    uniform, share = _size(*rests), len(views) / float(views.sum())
+    # Each texel's own value takes its share of the errors with it, and was before about as far from
     # that of all as the model of one value is off.
-    means = [_without_means(rest, texel, views) for rest in rests]
-    own = _size(*means) / math.sqrt(max(1 - share, share))
+    own = _size(*freed) / math.sqrt(max(1 - share, share))
     paid = share * math.log(max(uniform, own) / (own * math.sqrt(2 * math.pi * share)))
     return min(math.log(uniform), math.log(own) + max(paid, 0.0))
 
 
 def _without_means(values: Double, texel: Long, views: Long) -> Double:
-    sums = np.stack([np.bincount(texel, channel, len(views)) for channel in values.T], axis=-1)
-    return np.asarray(values - (sums / views[:, None])[texel])
+    return np.asarray(values - (_sums(values, texel, len(views)) / views[:, None])[texel])
 
 
 def _size(first: Double, second: Double) -> float:

@@ -14,7 +14,7 @@ from usdbrdf.shading.outside import Outside
 from usdbrdf.shading.unseen_lamps import UnseenLamps
 from usdbrdf.transport.environment import mean_radiance
 
-_EVEN = calibration.number("emitters.even")
+_EVEN, _LEAST_UNEVEN, _FOLLOWS = calibration.numbers("emitters.even")
 
 
 def doubt_of_outside(outside: Outside | None, lit: Float, measured: Bool) -> float:
@@ -64,31 +64,47 @@ def shines_evenly(
 ) -> Bool:
     """Objects (num_objects,) that are ``measured`` (T,) to be evenly bright in light that is not.
 
-    A reflector follows what reaches it, however badly the level of that is known: log L_d varies
-    as much as log S does, and by its texture more. radiance, L_d; irradiance, S, and its standard
-    ``error``, whose part of the variance is taken off: (T, 3).
+    A diffuse reflector follows what reaches it, however badly the level of that is known: log L_d
+    varies as much as log S does, and by its texture more. radiance, L_d; irradiance, S, and its
+    standard ``error``, whose part of the variance is taken off: (T, 3).
     """
-    light, reaches = radiance.mean(axis=1), irradiance.mean(axis=1)
-    noise = error.mean(axis=1) / np.maximum(reaches, 1e-30)
+    light, reaches, off = (values.mean(axis=1) for values in (radiance, irradiance, error))
     told = measured & (light > 0) & (reaches > 0)
     found = np.zeros(len(texels.resolution), np.bool_)
     for i in range(len(found)):
-        own = texels.of_object(i)
-        some = told[own]
-        if not texels.area[own][some].any():
+        own = texels.of_object(i).start + np.flatnonzero(told[texels.of_object(i)])
+        area = texels.area[own].astype(np.float64)
+        if not area.any():
             continue
-        area = texels.area[own][some].astype(np.float64)
-        of_noise = float(np.average(noise[own][some] ** 2, weights=area))
-        of_light, of_irradiance = (
-            _variance(np.log(values[own][some], dtype=np.float64), area)
-            for values in (light, reaches)
-        )
-        # What the error itself makes most of says nothing.
-        found[i] = of_irradiance > 2 * of_noise
-        found[i] &= of_light < _EVEN * (of_irradiance - of_noise)
+        # Where rays missed a lamp by chance S is small, and so is the error that they tell of it.
+        level = float(np.average(reaches[own], weights=area))
+        noise = float(np.average((off[own] / level) ** 2, weights=area))
+        bright, lit = (_middle(values[own], area) for values in (light, reaches))
+        of_light, of_irradiance = (_variance(logs, area) for logs in (bright, lit))
+        # What the error itself makes most of says nothing; and where lamps are told wrong, S may
+        # vary too much, but what a reflector shows of that still follows it.
+        found[i] = of_irradiance > max(2 * noise, _LEAST_UNEVEN**2)
+        found[i] &= of_light < _EVEN * (of_irradiance - noise)
+        found[i] &= _correlation(bright, lit, area) < _FOLLOWS
     return found
+
+
+def _middle(values: Float, weights: Double) -> Double:
+    """Logarithms of the values, none beyond the middle nine tenths of them: a rim that touches
+    something, and has next to no light, plays no part."""
+    order = np.argsort(values, kind="stable")
+    below = np.cumsum(weights[order]) - weights[order] / 2
+    ends = np.interp(np.array([0.05, 0.95]) * weights.sum(), below, values[order])
+    low, high = np.maximum(ends, 1e-30)
+    return np.asarray(np.log(np.clip(values, low, high)), np.float64)
 
 
 def _variance(values: Double, weights: Double) -> float:
     mean = np.average(values, weights=weights)
     return float(np.average((values - mean) ** 2, weights=weights))
+
+
+def _correlation(one: Double, other: Double, weights: Double) -> float:
+    means = [np.average(values, weights=weights) for values in (one, other)]
+    both = float(np.average((one - means[0]) * (other - means[1]), weights=weights))
+    return both / max(math.sqrt(_variance(one, weights) * _variance(other, weights)), 1e-30)

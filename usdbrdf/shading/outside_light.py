@@ -388,8 +388,11 @@ def levelled(
     reflected, inferred, known = (
         light[plain] for light in (asked.reflected, inferred * np.exp(shift), asked.irradiance)
     )
-    alike = np.ones(len(asked.owner)) if differing is None else differing()[asked.owner]
-    weight = doubt_by_views(alike[plain]) ** -2.0
+    alike = (np.ones(len(asked.owner)) if differing is None else differing()[asked.owner])[plain]
+    told = np.isfinite(alike)
+    # What few frames show tells no more than the usual.
+    alike = np.where(told, alike, np.median(alike[told]) if told.any() else 1.0)
+    weight = doubt_by_views(alike) ** -2.0
     for factor in np.geomspace(1, _BRIGHTEST, _STEPS):
         over = (reflected > known + factor * inferred).any(axis=1)
         if weight @ over < _OVER_ONE * weight.sum():

@@ -27,6 +27,7 @@ from usdbrdf.shading.clipped_light import ClippedLight, estimate_clipped_light
 from usdbrdf.shading.doubt import doubt_of_irradiance, doubt_of_outside, shines_evenly
 from usdbrdf.shading.hidden_light import KnownLamps, said_to_shine, with_hidden_light
 from usdbrdf.shading.outside import Outside
+from usdbrdf.shading.outside_light import doubt_by_views
 from usdbrdf.shading.panes import beside_panes
 from usdbrdf.shading.unseen_lamps import UnseenLamps, estimate_unseen_lamps
 from usdbrdf.texturing.inpaint import telling
@@ -66,8 +67,9 @@ def find_emitters(
     unknown_lamp: float = 0.0,
     unseen_lamps: Int | None = None,
     said: Mapping[int, bool] = MappingProxyType({}),
-    doubt: float | Double = 0.0,
+    doubt: float = 0.0,
     observed: Bool | None = None,
+    doubt_of_whole: Double | None = None,
 ) -> Emitters:
     """Emissive texels from L_d and S (T, 3), grouped per object.
 
@@ -78,17 +80,20 @@ def find_emitters(
     unseen_lamps: numbers of the objects that shine though no frame shows them; of these
     ``lower_bound`` is True
     said: of objects whether they shine as a whole or not at all, whatever they show
-    doubt: relative standard error of S, of all or (num_objects,), of which what shines must be
-    clear: what stands in a sun that is known badly is no lamp
+    doubt: relative standard error of S, of which what shines must be clear: what stands in a sun
+    that is known badly is no lamp
     observed (T,): by which of the texels seen or clipped an object is a lamp as a whole, all by
     default: of a bulb of glass the inside, which no frame shows, is lit by all the rest of it
     """
     light = radiance.mean(axis=1)
-    limit = np.broadcast_to(clear_of(doubt), len(texels.resolution))[texels.object_index()]
-    shines = np.pi * light > limit * irradiance.mean(axis=1)
     # A texel that no light reaches is dark, not a lamp: it must also beat the scene's median.
-    shines &= light > np.median(light)
-    shines &= clipped | (radiance.max(axis=1) >= unknown_lamp)
+    bright = (light > np.median(light)) & (clipped | (radiance.max(axis=1) >= unknown_lamp))
+    ratio = np.pi * light, irradiance.mean(axis=1)
+    shines = bright & (ratio[0] > clear_of(doubt) * ratio[1])
+    as_whole = shines
+    if doubt_of_whole is not None:
+        limit = clear_of(doubt_of_whole)[texels.object_index()]
+        as_whole = bright & (ratio[0] > limit * ratio[1])
     known = seen | clipped
     emissive = np.zeros(len(texels), np.bool_)
     num_objects = len(texels.resolution)
@@ -99,8 +104,8 @@ def find_emitters(
         own = texels.of_object(i)
         area = np.where(known[own], texels.area[own], 0)
         shown = area if observed is None else area * observed[own]
-        is_lamp[i] = (shown * shines[own]).sum() > _WHOLE_LAMP * shown.sum()
-        is_lamp[i] &= np.count_nonzero(shines[own] & known[own]) >= telling(len(area))
+        is_lamp[i] = (shown * as_whole[own]).sum() > _WHOLE_LAMP * shown.sum()
+        is_lamp[i] &= np.count_nonzero(as_whole[own] & known[own]) >= telling(len(area))
         is_lamp[i] = said.get(i, is_lamp[i])
         if is_lamp[i]:
             emissive[own] = True
@@ -111,7 +116,7 @@ def find_emitters(
             is_lamp[i], lower_bound[i], emissive[own] = True, True, True
             mean[i] = radiance[own].mean(axis=0)
             continue
-        glows = emissive[own] & shines[own] & (area > 0)
+        glows = emissive[own] & (as_whole if is_lamp[i] else shines)[own] & (area > 0)
         weight = area * (glows if glows.any() else emissive[own])
         exact = weight * seen[own]
         # Some of a lamp is often seen in long exposures alone; what the short one shows counts.
@@ -456,12 +461,15 @@ def shade_surface(
     may_shine = light.may_shine(coverage.clipped)
     doubt = doubt_of_irradiance(texels, light, unseen, outside, seen, irradiance)
     dimmest = light.least_of_lamps(clear_of(doubt) / np.pi * irradiance.max(axis=1))
-    # What shows by its evenness that it shines need not be clear of lamps that are known badly.
+    # What shows by its evenness that it shines need not be clear of lamps that are known badly;
+    # what mirrors an even wall looks alike, but another way from each side.
     even = shines_evenly(texels, light.lit, irradiance, traced.standard_error, seen)
-    of_object = np.where(even, doubt_of_outside(outside, light.lit, seen), doubt)
+    if even.any() and differing is not None:
+        even &= doubt_by_views(differing()) <= 1
+    of_whole = np.where(even, doubt_of_outside(outside, light.lit, seen), doubt)
     emitters = find_emitters(
-        texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, of_object,
-        coverage.observed,
+        texels, light.lit, irradiance, seen, may_shine, dimmest, unseen.object, said, doubt,
+        coverage.observed, of_whole,
     )  # fmt: skip
     told = coverage.tells_albedo
     albedo, over = albedo_map(texels, light.lit, irradiance, told, emitters.emissive)
