@@ -9,7 +9,7 @@ have three exposures in turn, a sensor's noise, 12 bits and saturation, and go t
 Denoise where it is installed (extra ``denoise``; the output says so).
 
 Cameras stand in the free space that is connected to the scene's own camera and look where surfaces
-were seen least; with --around DEGREES as far as that from it, around what the scene's camera looks
+were seen least; with --around DEGREES up to as far as that from it, around what the scene's camera looks
 at, and look there.
 
 truth/: clean views from poses that are not among the frames (view_NN.exr, views.json), the
@@ -83,6 +83,8 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    if options.around is not None and not 1 <= options.around <= 180:
+        parser.error("--around: from 1 to 180 degrees.")
     if options.output.exists():
         parser.error(f"{options.output} exists. Name a folder that does not.")
 
@@ -208,6 +210,8 @@ def looks_around(
     """Poses (4, 4), up to so many degrees from the ``eye`` and as far away, that look near the
     ``aim``."""
     reach, poses = float(np.linalg.norm(eye - aim)), []
+    if not np.isfinite(reach):
+        raise SystemExit("the scene's camera looks at nothing in its middle; --around needs that")
     while len(poses) < PLACES:
         away = unit(rng.normal(size=3))
         if away @ unit(eye - aim) < np.cos(np.radians(degrees)):
