@@ -9,8 +9,8 @@ have three exposures in turn, a sensor's noise, 12 bits and saturation, and go t
 Denoise where it is installed (extra ``denoise``; the output says so).
 
 Cameras stand in the free space that is connected to the scene's own camera and look where surfaces
-were seen least; with --around DEGREES up to as far as that from it, around what the scene's camera looks
-at, and look there.
+were seen least; with --around DEGREES up to as far as that from it, around what the scene's camera
+looks at, and look there.
 
 truth/: clean views from poses that are not among the frames (view_NN.exr, views.json), the
 material's albedo there (albedo_NN.exr), materials.json (kind, phi, psi, F0, and of coated materials
