@@ -126,8 +126,8 @@ def test_a_reflector_follows_the_light_on_it(panel):
 
 @pytest.mark.parametrize(("share", "dark"), [(0.02, 1e-3), (0.04, 0.02)])
 def test_a_rim_without_light_makes_no_lamp_of_a_wall(panel, share: float, dark: float):
-    asked, own, _ = panel
-    shading = np.full((own.max() + 1 + 4096, 3), SHADING)[: len(panel[2])]
+    asked, own, usual = panel
+    shading = np.full_like(usual, SHADING)
     shading[own[: round(share * len(own))]] *= dark
     assert asked(1.5 * SHADING / np.pi, shading)[:2] == (False, False)
 

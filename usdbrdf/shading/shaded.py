@@ -88,12 +88,12 @@ def find_emitters(
     light = radiance.mean(axis=1)
     # A texel that no light reaches is dark, not a lamp: it must also beat the scene's median.
     bright = (light > np.median(light)) & (clipped | (radiance.max(axis=1) >= unknown_lamp))
-    ratio = np.pi * light, irradiance.mean(axis=1)
-    shines = bright & (ratio[0] > clear_of(doubt) * ratio[1])
+    sends, receives = np.pi * light, irradiance.mean(axis=1)
+    shines = bright & (sends > clear_of(doubt) * receives)
     as_whole = shines
     if doubt_of_whole is not None:
         limit = clear_of(doubt_of_whole)[texels.object_index()]
-        as_whole = bright & (ratio[0] > limit * ratio[1])
+        as_whole = bright & (sends > limit * receives)
     known = seen | clipped
     emissive = np.zeros(len(texels), np.bool_)
     num_objects = len(texels.resolution)
