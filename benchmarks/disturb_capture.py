@@ -6,6 +6,7 @@
         [--exposure-ramp STOPS] [--balance-drift STOPS] [--vignetting STOPS] [--distortion K1]
         [--encode srgb|linear]
         [--mesh-scale F] [--mesh-mm X Y Z] [--mesh-degrees X Y Z] [--move-object NAME MM]
+        [--turn-faces SHARE] [--turn-objects N] [--rename-objects]
 
 CAPTURE is a folder with transforms.json, as `samples/study`. Disturbed are, frame by frame:
 
@@ -22,7 +23,8 @@ CAPTURE is a folder with transforms.json, as `samples/study`. Disturbed are, fra
     lens      focal length times F, principal point off by a share of the width as they are told;
               or the picture as a lens of the radial k1 shows it, which is not told
     mesh      larger by F about its middle, turned about it by a rotation vector, or moved; or one
-              object of it moved along x
+              object of it moved along x; or a share of its faces, and N whole objects, wound
+              backwards; or all objects called object_NNN, without a class
 
 The same seed gives the same capture. Files that do not change are hard links where the file system
 allows; the truth stays the truth.
@@ -49,7 +51,7 @@ from usdbrdf.untrusted.mesh_files import mesh_from_file
 
 DOCUMENT = "transforms.json"
 # Draws of one kind do not depend on whether another kind was asked for.
-POSES, EXPOSURES = 0, 1
+POSES, EXPOSURES, FACES = 0, 1, 2
 
 Array = npt.NDArray[np.float64]
 
@@ -82,6 +84,9 @@ def main() -> int:
         "--mesh-degrees", type=float, nargs=3, default=(0, 0, 0), metavar=("X", "Y", "Z")
     )
     parser.add_argument("--move-object", nargs=2, metavar=("NAME", "MM"))
+    parser.add_argument("--turn-faces", type=float, default=0.0, metavar="SHARE")
+    parser.add_argument("--turn-objects", type=int, default=0, metavar="N")
+    parser.add_argument("--rename-objects", action="store_true")
     options = parser.parse_args()
     if options.output.exists():
         parser.error(f"{options.output} exists. Name a folder that does not.")
@@ -95,6 +100,8 @@ def main() -> int:
     gains *= 2 ** (options.exposure_ramp * np.linspace(-0.5, 0.5, len(frames)))
     copy_unchanged(options.capture, options.output, images | {mesh_name(document)})
     disturb_mesh(options, document)
+    if options.rename_objects:
+        rename_objects(options.output / objects_name(document))
     for i, (frame, gain) in enumerate(zip(frames, gains, strict=True)):
         disturb_image(options.capture, options.output, frame, float(gain), options.clip)
         disturb_pixels(options, document, frame, i / (len(frames) - 1))
@@ -211,8 +218,13 @@ def mesh_name(document: dict[str, Any]) -> str:
     return str(document.get("mesh", "mesh.ply"))
 
 
+def objects_name(document: dict[str, Any]) -> str:
+    """Of the file that names the objects, likewise."""
+    return str(document.get("objects", "objects.json"))
+
+
 def disturb_mesh(options: argparse.Namespace, document: dict[str, Any]) -> None:
-    """Write the mesh, larger, turned, moved, or with one object of it elsewhere."""
+    """Write the mesh, larger, turned, moved, with one object elsewhere or faces backwards."""
     name_of_mesh = mesh_name(document)
     source = options.capture / name_of_mesh
     mesh = mesh_from_file(source)
@@ -224,15 +236,30 @@ def disturb_mesh(options: argparse.Namespace, document: dict[str, Any]) -> None:
     moved = middle + moved + np.array(options.mesh_mm) / 1000
     if options.move_object:
         name, millimetres = options.move_object
-        labels = json.loads((options.capture / document["objects"]).read_text())["objects"]
+        labels = json.loads((options.capture / objects_name(document)).read_text())["objects"]
         (number,) = (one["id"] for one in labels if one["name"] == name)
         own = np.unique(mesh.triangles[mesh.face_label == number])
         moved[own, 0] += float(millimetres) / 1000
-    if (moved == points).all():
+    rng = np.random.default_rng([options.seed, FACES])
+    backwards = rng.random(len(mesh.triangles)) < options.turn_faces
+    whole = rng.choice(np.unique(mesh.face_label), options.turn_objects, replace=False)
+    backwards |= np.isin(mesh.face_label, whole)
+    if (moved == points).all() and not backwards.any():
         link_or_copy(source, options.output / name_of_mesh)
         return
     moved_points = moved.astype(np.float32)
-    write_ply(options.output / name_of_mesh, moved_points, mesh.triangles, mesh.face_label)
+    triangles = np.where(backwards[:, None], mesh.triangles[:, ::-1], mesh.triangles)
+    write_ply(options.output / name_of_mesh, moved_points, triangles, mesh.face_label)
+
+
+def rename_objects(path: Path) -> None:
+    """Nothing of what an object is can be told by its name any more."""
+    document = json.loads(path.read_text())
+    for one in document["objects"]:
+        one["name"] = f"object_{one['id']:03d}"
+        one.pop("class_name", None)
+    path.unlink()  # it may be a link to the capture's own
+    path.write_text(json.dumps(document, indent=1) + "\n")
 
 
 def disturbed_pose(pose: Array, degrees: Array, metres: Array) -> Array:

@@ -65,66 +65,61 @@ def conductor_of(
     bases       twice roughnesses -> (base, slope), (P, 3, K), with independent noise
     of_dielectric  the same of the ``dielectric``'s kind of lobe, where that is another
     """
-    count = int(texel.max()) + 1
-    views = np.bincount(texel, minlength=count)
-    mean = np.bincount(texel, radiance.mean(axis=1), count) / views
-    level = np.maximum(mean, 1e-3 * mean.mean())[texel][:, None]
+    views = np.bincount(texel)
+    level = _level_of_texels(radiance, texel, views)
     seen = radiance / level
     lobes = [_relative(basis(_PHIS), level) for basis in bases]
-    errors, reflectances = np.zeros(len(_PHIS)), np.zeros((len(_PHIS), 3))
-    for k in range(len(_PHIS)):
-        (base, slope), (other_base, other_slope) = ((b[..., k], s[..., k]) for b, s in lobes)
-        f0 = _least_squares(seen, (base, other_base), (slope, other_slope))
-        reflectances[k] = f0
-        errors[k] = _size(seen - base - f0 * slope, seen - other_base - f0 * other_slope)
+    reflectances, errors = _at_every_roughness(seen, lobes)
     best = int(errors.argmin())
     f0 = reflectances[best]
     # What is rougher still than all that are tried looks like a diffuse surface, and may be one.
     if (f0.mean() < _LEAST_F0 or best == len(_PHIS) - 1) and not certain:
         return None
     found = [_relative(basis([dielectric.phi]), level) for basis in of_dielectric or bases]
-    psi = dielectric.psi * F0_OF_PSI
-    one, other = ((base + psi * slope)[..., 0] for base, slope in found)
-    diffuse = irradiance / np.pi / level
-    albedo = _least_squares(seen, (one, other), (diffuse, diffuse))
-    rests = [seen - part - albedo * diffuse for part in (one, other)]
-    of_rival = _log_error(rests, [_without_means(rest, texel, views) for rest in rests], views)
+    lit = irradiance / np.pi / level
+    of_rival = _log_error_of_dielectric(seen, found, dielectric.psi, lit, texel, views)
     of_best = [(base[..., best], slope[..., best]) for base, slope in lobes]
     models = [base + f0 * slope for base, slope in of_best]
-    scale = _scale_of_texels(seen, models, texel, count)[texel]
-    of_metal = _log_error(
-        [seen - model for model in models], [seen - scale * model for model in models], views
-    )
-    clearer = of_rival - of_metal
+    clearer = of_rival - _log_error_of_metal(seen, models, texel, views)
     # A diffuse part passes for that of a metal whose light is told too dark, and changes not.
     changing = _of_changes(seen, of_best, models, texel, views)
     f0, scatter = _median_of_texels(seen, of_best, models, texel)
     told = clearer >= _CLEARER and changing.mean() >= max(_OF_CHANGES * f0.mean(), _LEAST_F0)
     if not told and not certain:
         return None
-    likely = np.exp(-0.5 * count * (np.log(errors / errors[best])))
-    likely *= np.gradient(np.array(_PHIS))
-    likely /= likely.sum()
-    phi = float(likely @ np.array(_PHIS))
-    phi_error = math.sqrt(float(likely @ (np.array(_PHIS) - phi) ** 2))
+    phi_error, spread = _spread(reflectances, errors, len(views))
     return Conductor(
         phi=float(_PHIS[best]),
         f0=(float(f0[0]), float(f0[1]), float(f0[2])),
         # The grid's step and what the model lacks are errors too.
         phi_error=math.hypot(phi_error, float(np.gradient(np.array(_PHIS))[best]) / 2),
-        f0_error=math.hypot(
-            math.sqrt(float((likely @ (reflectances - reflectances[best]) ** 2).mean())),
-            float(scatter.mean()),
-            _MODEL_ERROR,
-        ),
+        f0_error=math.hypot(spread, float(scatter.mean()), _MODEL_ERROR),
         clearer=clearer,
     )
 
 
-def _relative(lobe: tuple[Float, Float], level: Float) -> tuple[Double, Double]:
+def _level_of_texels(radiance: Float, texel: Long, views: Long) -> Double:
+    """(P, 1): what the sample's texel shows in the mean of its views and channels, not quite 0."""
+    mean = np.bincount(texel, radiance.mean(axis=1)) / views
+    return np.asarray(np.maximum(mean, 1e-3 * mean.mean())[texel][:, None])
+
+
+def _relative(lobe: tuple[Float, Float], level: Double) -> tuple[Double, Double]:
     """base, and the slope by F0, in units of what texels show."""
     base, slope = (part / level[..., None] for part in lobe)
     return base.astype(np.float64), slope.astype(np.float64) / F0_OF_PSI
+
+
+def _at_every_roughness(seen: Double, lobes: list[tuple[Double, Double]]) -> tuple[Double, Double]:
+    """The metal of least error at each of the roughnesses: its reflectance (K, 3), and the size of
+    the error (K,) that it leaves."""
+    errors, reflectances = np.zeros(len(_PHIS)), np.zeros((len(_PHIS), 3))
+    for k in range(len(_PHIS)):
+        (base, slope), (other_base, other_slope) = ((b[..., k], s[..., k]) for b, s in lobes)
+        f0 = _least_squares(seen, (base, other_base), (slope, other_slope))
+        reflectances[k] = f0
+        errors[k] = _size(seen - base - f0 * slope, seen - other_base - f0 * other_slope)
+    return reflectances, errors
 
 
 def _least_squares(
@@ -179,6 +174,17 @@ def _scale_of_texels(seen: Double, models: list[Double], texel: Long, count: int
     return np.where(known, np.clip(product / np.where(known, squares, 1), 0, _BRIGHTER), 1)
 
 
+def _spread(reflectances: Double, errors: Double, texels: int) -> tuple[float, float]:
+    """Standard deviations of phi and of the reflectance over the roughnesses, by what the errors
+    make of their likelihood, of as many independent samples as there are texels."""
+    phis, best = np.array(_PHIS), errors.argmin()
+    likely = np.exp(-0.5 * texels * np.log(errors / errors[best])) * np.gradient(phis)
+    likely /= likely.sum()
+    of_phi = float(likely @ (phis - likely @ phis) ** 2)
+    of_f0 = float((likely @ (reflectances - reflectances[best]) ** 2).mean())
+    return math.sqrt(of_phi), math.sqrt(of_f0)
+
+
 def _of_changes(
     seen: Double, lobes: list[tuple[Double, Double]], models: list[Double], texel: Long, views: Long
 ) -> Double:
@@ -200,6 +206,28 @@ def _of_changes(
 def _sums(values: Double | Bool, texel: Long, count: int) -> Double:
     """(T, 3) over the views of each texel."""
     return np.stack([np.bincount(texel, channel, count) for channel in values.T], axis=-1)
+
+
+def _log_error_of_dielectric(
+    seen: Double,
+    lobes: list[tuple[Double, Double]],
+    psi: float,
+    lit: Double,
+    texel: Long,
+    views: Long,
+) -> float:
+    """See ``_log_error``. lit (P, 3): what a white texel would show of its irradiance."""
+    one, other = ((base + psi * F0_OF_PSI * slope)[..., 0] for base, slope in lobes)
+    albedo = _least_squares(seen, (one, other), (lit, lit))
+    rests = [seen - part - albedo * lit for part in (one, other)]
+    return _log_error(rests, [_without_means(rest, texel, views) for rest in rests], views)
+
+
+def _log_error_of_metal(seen: Double, models: list[Double], texel: Long, views: Long) -> float:
+    """See ``_log_error``."""
+    scale = _scale_of_texels(seen, models, texel, len(views))[texel]
+    freed = [seen - scale * model for model in models]
+    return _log_error([seen - model for model in models], freed, views)
 
 
 def _log_error(rests: list[Double], freed: list[Double], views: Long) -> float:

@@ -27,6 +27,37 @@ _OF_LIGHTING = ("texture", "shade")
 # Frames that are read for their exposures, pixels across the map, and names in a sentence, at most.
 _MOST_READ, _MAP_WIDTH, _MOST_NAMED = 96, 480, 6
 _FLOORLESS = np.array((40, 44, 52), np.uint8)
+# Of words why a lobe was not measured, in this order: what is said of one object, and of several.
+_BOUNDED = (
+    "bounded: photographs do not determine both numbers, but tell that highlights are weaker than "
+    "usual, if there are any."
+)
+_UNDETERMINED = (
+    "not determined: no photograph shows a clear highlight, so the numbers are what remains likely."
+)
+_SPARSE = "seen in too few pixels for a fit: the numbers are a guess."
+_FAILED = "photographs do not determine the numbers."
+_GLIMPSED = "was measured, and everything but a colour is a guess."
+_NOT_MEASURED = {
+    "bounded": (f"{{n}} is {_BOUNDED}", f"{{n}} are {_BOUNDED}"),
+    "undetermined": (f"{{n}} is {_UNDETERMINED}", f"{{n}} are {_UNDETERMINED}"),
+    "sparse": (f"{{n}} is {_SPARSE}", f"{{n}} are {_SPARSE}"),
+    "contradicted": (
+        "The views of {n} contradict that it is a surface: something is seen through it or in it.",
+        "The views of {n} contradict that they are surfaces: something is seen through them or in "
+        "them.",
+    ),
+    "told": ("{n} was not fitted, by directive.", "{n} were not fitted, by directive."),
+    "pane": ("{n} is a pane before the outside.", "{n} are panes before the outside."),
+    "failed": (
+        f"The fit of {{n}} failed: its {_FAILED}",
+        f"The fit of {{n}} failed: their {_FAILED}",
+    ),
+    "glimpsed": (
+        f"Photographs hardly show {{n}}: nothing on it {_GLIMPSED}",
+        f"Photographs hardly show {{n}}: nothing on them {_GLIMPSED}",
+    ),
+}
 
 
 def summaries(asset: Asset) -> dict[str, dict[str, Any]]:
@@ -152,60 +183,42 @@ def findings(
     metals          those of objects that are metals, measured well or not
     dark_outside    whether next to no light comes from what photographs show out there
     """
-    count = {word: words.count(word) for word in set(words)}
     total = len(words)
-    told = [
-        f"{count.get('measured', 0)} of {total} objects have a measured roughness and specular."
-    ]
+    told = [f"{words.count('measured')} of {total} objects have a measured roughness and specular."]
     if metals:
         told.append(
             f"{len(metals)} {_by_count(len(metals), 'is a metal', 'are metals')}: "
             f"{first_of(metals, _MOST_NAMED)}."
         )
-    if bounded := count.get("bounded"):
-        told.append(
-            f"{bounded} {_by_count(bounded, 'is', 'are')} bounded: photographs do not determine "
-            "both numbers, but tell that highlights are weaker than usual, if there are any."
-        )
-    if unknown := count.get("undetermined"):
-        told.append(
-            f"{unknown} {_by_count(unknown, 'is', 'are')} not determined: no photograph shows a "
-            "clear highlight, so the numbers are what remains likely."
-        )
-    if sparse := count.get("sparse"):
-        told.append(
-            f"{sparse} {_by_count(sparse, 'is', 'are')} seen in too few pixels for a fit: the "
-            "numbers are a guess."
-        )
-    if contradicted := count.get("contradicted"):
-        told.append(
-            f"The views of {contradicted} contradict that "
-            f"{_by_count(contradicted, 'it is a surface', 'they are surfaces')}: something is seen "
-            f"through {_by_count(contradicted, 'it or in it', 'them or in them')}."
-        )
-    if left := count.get("told"):
-        told.append(f"{left} {_by_count(left, 'was', 'were')} not fitted, by directive.")
-    if panes := count.get("pane"):
-        told.append(f"{panes} {_by_count(panes, 'is a pane', 'are panes')} before the outside.")
-    if failed := count.get("failed"):
-        told.append(
-            f"The fit of {failed} failed: {_by_count(failed, 'its', 'their')} photographs do not "
-            "determine the numbers."
-        )
-    if glimpsed := count.get("glimpsed"):
-        told.append(
-            f"Photographs hardly show {glimpsed}: nothing on {_by_count(glimpsed, 'it', 'them')} "
-            "was measured, and everything but a colour is a guess."
-        )
-    if unseen := count.get("unseen"):
+    told += _of_objects(words)
+    if unseen := words.count("unseen"):
         told.append(f"No photograph shows {unseen if unseen < total else 'any'} of the objects.")
-    if lamps := count.get("lamp"):
+    if lamps := words.count("lamp"):
         told.append(f"{lamps} {_by_count(lamps, 'is a lamp', 'are lamps')}.")
     if shining_parts:
         many = len(shining_parts)
         parts = f"{_by_count(many, 'A part', 'Parts')} of {first_of(shining_parts, _MOST_NAMED)}"
         told.append(f"{parts} {_by_count(many, 'shines', 'shine')}, too.")
-    texture, shade = found["texture"], found["shade"]
+    told += _of_light(found["texture"], found["shade"], never_observed, dark_outside)
+    if not radiometric:
+        told.append("The images are not radiometric: albedo and fit have no absolute meaning.")
+    return told
+
+
+def _of_objects(words: Sequence[str]) -> list[str]:
+    """A sentence on those that share a word, of each that says why a lobe was not measured."""
+    counts = ((words.count(word), says) for word, says in _NOT_MEASURED.items())
+    return [_by_count(n, *says).format(n=n) for n, says in counts if n]
+
+
+def _of_light(
+    texture: Mapping[str, Any],
+    shade: Mapping[str, Any],
+    never_observed: Collection[str],
+    dark_outside: bool,
+) -> list[str]:
+    """How well surfaces and the light on them are known, by what the two steps found."""
+    told = []
     if "measured_fraction" in texture:
         told.append(
             f"Photographs measured {texture['measured_fraction']:.1%} of the surface; "
@@ -223,8 +236,6 @@ def findings(
     for wanted in (False, True):
         names = [name for name in estimated if (name in never_observed) == wanted]
         told += _estimated_lamps(names, never_observed=wanted)
-    if not radiometric:
-        told.append("The images are not radiometric: albedo and fit have no absolute meaning.")
     return told
 
 

@@ -134,7 +134,6 @@ def _data_of(asset: Asset, options: ReportOptions, folder: Path) -> dict[str, An
         undetermined_because(fit, word, in_sight=bool(where.in_sight[i]))
         for i, (fit, word) in enumerate(zip(fits, words, strict=True))
     ]
-    lamps = [o.identifier for o, w in zip(atlas.scene.objects, words, strict=True) if w == "lamp"]
     widest = chosen[shows_most(where.share)]
     colours = next((n for n in ("base_color", "albedo") if atlas.has(n)), "lit")
     shown, rows = scored or rendered_views(seen, views, pictures)
@@ -143,32 +142,9 @@ def _data_of(asset: Asset, options: ReportOptions, folder: Path) -> dict[str, An
         "published": read_manifest(place.folder).version if place.is_published else "",
         "version": code_version(),
         "photographs": pictures,
-        "capture": {
-            "frames": len(frames),
-            "resolution": frames.resolution[0].tolist(),
-            "encoding": frames.encoding,
-            "lighting": atlas.lighting,
-            "radiometric": bool(frames.radiometric),
-            "adapter": str(found["ingest"].get("adapter", "")),
-            "triangles": len(atlas.scene.triangles),
-            "texels": len(atlas.texels),
-        },
-        "findings": findings(
-            found,
-            reasons,
-            bool(frames.radiometric),
-            _with_texels(atlas, lambda own: not atlas.coverage.observed[own].any()),
-            [
-                name
-                for name in _with_texels(atlas, lambda own: bool(atlas.emissive[own].any()))
-                if name not in lamps
-            ],
-            metals=[
-                obj.identifier
-                for obj, fit in zip(atlas.scene.objects, fits, strict=True)
-                if fit is not None and fit.is_metal and obj.identifier not in lamps
-            ],
-            dark_outside=is_dark(seen.lit.environment, atlas),
+        "capture": _of_capture(atlas, str(found["ingest"].get("adapter", ""))),
+        "findings": _found_out(
+            atlas, fits, words, reasons, found, is_dark(seen.lit.environment, atlas)
         ),
         "warnings": _tellable(warnings_of(found), frames, pictures),
         "rows": [unnamed(row, pictures) for row in frame_rows(frames)],
@@ -191,6 +167,47 @@ def _data_of(asset: Asset, options: ReportOptions, folder: Path) -> dict[str, An
         "advice": None if advice is None else {"poses": advice[0], "current": advice[1]},
         **said,
     }
+
+
+def _of_capture(atlas: AssetMaps, adapter: str) -> dict[str, Any]:
+    """What went in."""
+    frames = atlas.frames
+    return {
+        "frames": len(frames),
+        "resolution": frames.resolution[0].tolist(),
+        "encoding": frames.encoding,
+        "lighting": atlas.lighting,
+        "radiometric": bool(frames.radiometric),
+        "adapter": adapter,
+        "triangles": len(atlas.scene.triangles),
+        "texels": len(atlas.texels),
+    }
+
+
+def _found_out(
+    atlas: AssetMaps,
+    fits: Sequence[FittedObject | None],
+    words: Sequence[str],
+    reasons: Sequence[str],
+    found: Mapping[str, Mapping[str, Any]],
+    dark_outside: bool,
+) -> list[str]:
+    """The sentences of ``findings``; words are those of ``status_of``, of each object."""
+    named = [obj.identifier for obj in atlas.scene.objects]
+    lamps = {name for name, word in zip(named, words, strict=True) if word == "lamp"}
+    shining = _with_texels(atlas, lambda own: bool(atlas.emissive[own].any()))
+    metals = [
+        name for name, fit in zip(named, fits, strict=True) if fit is not None and fit.is_metal
+    ]
+    return findings(
+        found,
+        reasons,
+        bool(atlas.frames.radiometric),
+        _with_texels(atlas, lambda own: not atlas.coverage.observed[own].any()),
+        [name for name in shining if name not in lamps],
+        metals=[name for name in metals if name not in lamps],
+        dark_outside=dark_outside,
+    )
 
 
 def _refuse_without_photographs(asset: Asset, frames: Frames) -> None:
