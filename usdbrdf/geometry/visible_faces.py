@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from usdbrdf.kernel import kernel, loop, parallel_kernel
+from usdbrdf.kernel import kernel, parallel_kernel
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.transport.rays import BOX_FACES, RayScene
