@@ -90,9 +90,11 @@ def falloff_of_frames(samples: Samples) -> Falloff | None:
     known &= (known.sum(axis=1) > 1)[:, None]
     if int(known.sum()) < _FEWEST:
         return None
-    radius2 = samples.radius2.astype(np.float64)
+    # Of what no two frames show nothing is told.
+    shared = np.flatnonzero(known.any(axis=1))
+    part, value, known = shared % _PARTS, value[shared], known[shared]
+    radius2 = samples.radius2[shared].astype(np.float64)
     whole = _coefficients(value, radius2, known)
-    part = np.arange(len(value)) % _PARTS
     of_parts = [part == k for k in range(_PARTS)]
     parts = [sum(_coefficients(value[own], radius2[own], known[own])) for own in of_parts]
     error = float(np.std(parts, ddof=1)) / math.sqrt(_PARTS)
