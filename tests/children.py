@@ -42,7 +42,7 @@ _IMPORTED = (
 _OF_PROGRAMS = (
     "tests.fault_injection", "usdbrdf.capture.adapters", "usdbrdf.cli", "usdbrdf.commands",
     "usdbrdf.pipeline", "usdbrdf.tasks.fit", "usdbrdf.tasks.ingest", "usdbrdf.tasks.shade",
-    "usdbrdf.tasks.texture",
+    "usdbrdf.tasks.texture", "tests.first_kernel",
 )  # fmt: skip
 # What has threads cannot be forked; USD would say that it has none.
 _NO_THREADS = {

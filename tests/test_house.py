@@ -599,6 +599,18 @@ def test_each_dependency_has_its_place():
     )
 
 
+def test_what_few_runs_need_is_loaded_by_these():
+    """trimesh takes a tenth of a second: only to write a GLB is it needed whatever comes in."""
+    at_once = {
+        place(name)
+        for name, (_, tree) in modules().items()
+        for node in tree.body
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        and any(full.split(".")[0] == "trimesh" for full in imported(ast.Module([node], [])))
+    }
+    assert at_once == {"delivery/glb.py"}
+
+
 def test_few_open_files():
     opening = set()
     for name, (_, tree) in modules().items():

@@ -89,6 +89,22 @@ def test_one_surface_on_another_is_left_to_rays():
     _agree(rays, look_at(np.array([0.3, 0.4, 1.5]), np.zeros(3)))
 
 
+def test_a_picture_that_is_small_beside_its_mesh_is_traced(monkeypatch):
+    points, triangles, _, _ = room_mesh(subdivisions=24)
+    rays = RayScene(points, triangles)
+    monkeypatch.setattr(f"{__name__}.SIZE", (32, 24))
+    monkeypatch.setattr(f"{__name__}.LENS", np.array([18.0, 22.0, 15.3, 12.9]))
+    pose = ring_of_poses(1)[0]
+    drawn = []
+    draw = module._draw
+    monkeypatch.setattr(module, "_draw", lambda *given: drawn.append(given) or draw(*given))
+    traced = _agree(rays, pose)
+    assert not drawn
+    monkeypatch.setattr(module, "_CROWDED", 1000)
+    np.testing.assert_array_equal(_agree(rays, pose), traced)
+    assert drawn
+
+
 def test_nothing_to_see():
     rays = RayScene(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
     away = look_at(np.full(3, 4.0), np.full(3, 9.0))

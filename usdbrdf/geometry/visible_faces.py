@@ -3,7 +3,8 @@
 A pixel's ray and a triangle's three planes through the eye (J. Olano and T. Greer, "Triangle scan
 conversion using 2D homogeneous coordinates", Graphics Hardware 1997): nothing is clipped, and the
 answer is a ray tracer's, at a fraction of its time. Where rounding could decide otherwise than a
-ray would (at an edge, or where two surfaces meet) the pixel is left to a ray.
+ray would (at an edge, or where two surfaces meet) the pixel is left to a ray; and each pixel of a
+picture that is small beside what it shows, where to ask all triangles would take longer.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ _EDGE, _DEPTH = 4e-3, 2e-5
 # which takes longer than to draw what small pictures show of them: so many rows has each at least.
 _BANDS, _LEAST_ROWS = 32, 16
 _BEHIND = 1e-9
+# Of so many triangles in view for each pixel, rays find the nearest sooner than drawing does.
+_CROWDED = 2
 
 
 class _Pinhole(NamedTuple):
@@ -67,18 +70,21 @@ def visible_faces(rays: RayScene, camera: Camera) -> tuple[Int, Float]:
         np.ascontiguousarray((axes * [1.0, -1.0, -1.0]).T),
         fx, fy, cx, cy, camera.width, camera.height,
     )  # fmt: skip
-    mesh = _Mesh(rays.points, rays.triangles)
-    boxes = np.flatnonzero(_boxes_in_view(rays.boxes, pinhole))
-    faces = np.full((len(boxes), BOX_FACES), -1, np.int32)
-    rows = np.zeros((len(boxes), BOX_FACES, 2), np.int32)
-    _faces_in_view(len(boxes), mesh, boxes, pinhole, faces, rows)
-    kept = faces >= 0
     size = camera.height, camera.width
+    boxes = np.flatnonzero(_boxes_in_view(rays.boxes, pinhole))
+    if len(boxes) * BOX_FACES > _CROWDED * camera.width * camera.height:
+        face, point = _traced(rays, camera, camera.pixels())
+        return face.reshape(size), point.reshape(*size, 3)
+    mesh = _Mesh(rays.points, rays.triangles)
+    faces = np.full((len(boxes), BOX_FACES), -1, np.int32)
+    extents = np.zeros((len(boxes), BOX_FACES, 4), np.int32)
+    _faces_in_view(len(boxes), mesh, boxes, pinhole, faces, extents)
+    kept = faces >= 0
     picture = _Picture(
         np.full(size, -1, np.int32), np.zeros(size, np.float32), np.zeros(size, np.float32)
     )
     bands = _bands(camera.height)
-    _draw(bands, bands, mesh, faces[kept], rows[kept], pinhole, picture)
+    _draw(bands, bands, mesh, faces[kept], extents[kept], pinhole, picture)
     point = np.empty((*size, 3), np.float32)
     _points(len(point), pinhole, picture.nearness, point)
     _trace_doubtful(rays, camera, picture, point)
@@ -97,11 +103,16 @@ def _trace_doubtful(rays: RayScene, camera: Camera, picture: _Picture, point: Fl
     row, column = np.nonzero((doubt > 0) & (doubt >= nearness * np.float32(1 - _DEPTH)))
     if not len(row):
         return
-    origins, directions = camera.rays(np.stack([column + 0.5, row + 0.5], axis=-1))
+    pixels = np.stack([column + 0.5, row + 0.5], axis=-1)
+    picture.face[row, column], point[row, column] = _traced(rays, camera, pixels)
+
+
+def _traced(rays: RayScene, camera: Camera, pixels: Double) -> tuple[Int, Float]:
+    """Triangle and point, as of ``visible_faces``, at places in the picture (S, 2)."""
+    origins, directions = camera.rays(pixels)
     hits = rays.closest(origins, directions)
     reached = origins + directions * hits.distance[:, None]
-    picture.face[row, column] = hits.face
-    point[row, column] = np.where(hits.face[:, None] >= 0, reached, 0)
+    return hits.face, np.where(hits.face[:, None] >= 0, reached, np.float32(0))
 
 
 def _boxes_in_view(boxes: Float, camera: _Pinhole) -> Bool:
@@ -165,9 +176,9 @@ def _extent(a: Vector, b: Vector, c: Vector, camera: _Pinhole) -> tuple[int, int
 
 @parallel_kernel
 def _faces_in_view(
-    start: int, stop: int, mesh: _Mesh, boxes: Long, camera: _Pinhole, faces: Int, rows: Int
+    start: int, stop: int, mesh: _Mesh, boxes: Long, camera: _Pinhole, faces: Int, extents: Int
 ) -> None:
-    """Of each box the triangles that can cover a pixel's centre, and in which rows."""
+    """Of each box the triangles that can cover a pixel's centre, and their extents."""
     for i in range(start, stop):
         first = boxes[i] * BOX_FACES
         for k in range(min(BOX_FACES, len(mesh.triangles) - first)):
@@ -176,8 +187,8 @@ def _faces_in_view(
             left, right, top, bottom = _extent(a, b, c, camera)
             if left <= right and top <= bottom:
                 faces[i, k] = f
-                rows[i, k, 0] = top
-                rows[i, k, 1] = bottom
+                extents[i, k, 0], extents[i, k, 1] = left, right
+                extents[i, k, 2], extents[i, k, 3] = top, bottom
 
 
 @kernel
@@ -193,7 +204,7 @@ def _corners(mesh: _Mesh, f: int, camera: _Pinhole) -> tuple[Vector, Vector, Vec
 
 @parallel_kernel
 def _draw(
-    first: int, last: int, bands: int, mesh: _Mesh, faces: Int, rows: Int, camera: _Pinhole,
+    first: int, last: int, bands: int, mesh: _Mesh, faces: Int, extents: Int, camera: _Pinhole,
     picture: _Picture,
 ) -> None:  # fmt: skip
     height = camera.height
@@ -203,8 +214,10 @@ def _draw(
         low = band * height // bands
         high = (band + 1) * height // bands
         for j in range(len(faces)):
-            if rows[j, 0] < high and rows[j, 1] >= low:
-                _draw_face(mesh, faces[j], low, high, camera, picture)
+            if extents[j, 2] < high and extents[j, 3] >= low:
+                rows = max(extents[j, 2], low), min(extents[j, 3] + 1, high)
+                columns = extents[j, 0], extents[j, 1] + 1
+                _draw_face(mesh, faces[j], rows, columns, camera, picture)
 
 
 @kernel
@@ -227,17 +240,18 @@ def _side(p: Vector, q: Vector, camera: _Pinhole, sign: float) -> Vector:
     length = np.sqrt(a * a + b * b)
     if length == 0:
         return 0.0, 0.0, 0.0  # no edge at all: in doubt
-    return a / length, b / length, c / length
+    scale = 1 / length
+    return a * scale, b * scale, c * scale
 
 
 @kernel
 def _draw_face(
-    mesh: _Mesh, f: int, low: int, high: int, camera: _Pinhole, picture: _Picture
-) -> None:
-    """One triangle into the rows low to high."""
+    mesh: _Mesh, f: int, rows: tuple[int, int], columns: tuple[int, int], camera: _Pinhole,
+    picture: _Picture,
+) -> None:  # fmt: skip
+    """One triangle into some rows and columns, from the first to before the last."""
     face, nearness, doubt = picture.face, picture.nearness, picture.doubt
     a, b, c = _corners(mesh, f, camera)
-    left, right, top, bottom = _extent(a, b, c, camera)
     n = _cross((b[0] - a[0], b[1] - a[1], b[2] - a[2]), (c[0] - a[0], c[1] - a[1], c[2] - a[2]))
     volume = n[0] * a[0] + n[1] * a[1] + n[2] * a[2]
     sign = 1.0 if volume >= 0 else -1.0
@@ -249,12 +263,12 @@ def _draw_face(
         wx, wy, w1 = _on_image(n, camera, 1 / volume)
     nearest = min(a[2], b[2], c[2])
     at_most = 1 / nearest if nearest > _BEHIND else np.inf
-    for row in range(max(top, low), min(bottom + 1, high)):
+    for row in range(rows[0], rows[1]):
         in_a = a1 + ay * row
         in_b = b1 + by * row
         in_c = c1 + cy * row
         in_w = w1 + wy * row
-        for column in range(left, right + 1):
+        for column in range(columns[0], columns[1]):
             inside = min(in_a + ax * column, in_b + bx * column, in_c + cx * column)
             if inside < -_EDGE:
                 continue

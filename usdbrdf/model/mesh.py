@@ -262,16 +262,24 @@ def across_triangles(points: Float | Double, triangles: Int) -> Double:
 
 def face_normals_and_angles(points: Float, triangles: Int) -> tuple[Double, Double]:
     """Unit face normals (F, 3) and corner angles (F, 3) in radians; zeros without area."""
-    corner = points.astype(np.float64)[triangles]
+    # x, y and z of the first, second and third corners, (3, 3, F): NumPy is several times as fast
+    # along the many faces as along the three numbers of each.
+    corner = np.ascontiguousarray(points.T, np.float64)[:, triangles.T]
     edge = np.roll(corner, -1, axis=1) - corner  # from each corner to the next
-    length = np.linalg.norm(edge, axis=2, keepdims=True)
+    length = _lengths(edge)
     # Unit edges first: the product of two tiny edges would underflow, that of unit ones cannot.
-    edge = np.divide(edge, length, out=np.zeros_like(edge), where=length > 0)
-    across = np.cross(edge, -np.roll(edge, 1, axis=1))
-    sine = np.linalg.norm(across, axis=2)
-    cosine = -(edge * np.roll(edge, 1, axis=1)).sum(axis=2)
-    best = np.take_along_axis(across, sine.argmax(axis=1)[:, None, None], axis=1)[:, 0]
-    size = np.linalg.norm(best, axis=1, keepdims=True)
+    x, y, z = edge = np.divide(edge, length, out=np.zeros_like(edge), where=length > 0)
+    u, v, w = back = -np.roll(edge, 1, axis=1)
+    across = np.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+    sine, cosine = _lengths(across), (edge * back).sum(axis=0)
+    best = np.take_along_axis(across, sine.argmax(axis=0)[None, None], axis=1)[:, 0]
+    size = _lengths(best)
     has_area = size > 1e-12
     normal = np.divide(best, size, out=np.zeros_like(best), where=has_area)
-    return normal, np.where(has_area, np.arctan2(sine, cosine), 0.0)
+    angles = np.where(has_area, np.arctan2(sine, cosine), 0.0)
+    return np.ascontiguousarray(normal.T), np.ascontiguousarray(angles.T)
+
+
+def _lengths(vectors: Double) -> Double:
+    """(...) of (3, ...)."""
+    return np.asarray(np.sqrt((vectors * vectors).sum(axis=0)))

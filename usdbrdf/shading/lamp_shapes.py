@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from trimesh.bounds import oriented_bounds_2D
 
 from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Int
@@ -139,6 +138,8 @@ def _flat_shape(corners: Double, normals: Double, area: Double, light: Double) -
     if np.ptp(p[:, 2]) > 2 * _FLAT * diagonal:
         return None
     height = float(p[:, 2].max()) + _GAP * diagonal
+    from trimesh.bounds import oriented_bounds_2D  # takes a tenth of a second to load
+
     to_box, extents = oriented_bounds_2D(p[:, :2])
     fill = float(area.sum() / np.prod(extents))
     if fill >= _RECTANGLE_FILL:

@@ -16,10 +16,12 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.files.frames import FramePixels
+from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh, across_triangles
 from usdbrdf.texturing.exposures import gains_of_frames
+from usdbrdf.texturing.samples import Projection
 from usdbrdf.transport.rays import RayScene
 
 MIN_COSINE = calibration.number("agreement.min_cosine")
@@ -73,36 +75,63 @@ def logarithms_in_frame(
     pixels; NaN where it shows nothing valid."""
     found = np.full(len(surface.point), np.nan, np.float32)
     seen, column, row = seen_points(surface, rays, camera)
-    places = [(row + down, column + right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
-    found[seen] = np.log(np.mean([_levels(pixels, place) for place in places], axis=0))
+    level = np.empty(len(column), np.float32)
+    _levels(pixels.radiance, pixels.valid, column, row, level)
+    found[seen] = np.log(level)
     return found
 
 
-def _levels(pixels: FramePixels, place: tuple[Long, Long]) -> Float:
-    """Means of R, G and B of some pixels alone: photographs have millions; NaN where not valid."""
-    level = pixels.radiance[place].mean(axis=1)
-    return np.where(pixels.valid[place] & (level > 0), level, np.nan)
+@loop
+def _levels(radiance: Float, valid: Bool, column: Long, row: Long, level: Float) -> None:
+    """Means of R, G and B over 3 x 3 pixels about some alone: photographs have millions; NaN where
+    one of them is not valid."""
+    for k in range(len(level)):
+        total = np.float32(0)
+        for j in range(row[k] - 1, row[k] + 2):
+            for i in range(column[k] - 1, column[k] + 2):
+                mean = (radiance[j, i, 0] + radiance[j, i, 1] + radiance[j, i, 2]) / np.float32(3)
+                total += mean if valid[j, i] and mean > 0 else np.float32(np.nan)
+        level[k] = total / np.float32(9)
 
 
 def seen_points(surface: MeshPoints, rays: RayScene, camera: Camera) -> tuple[Bool, Long, Long]:
     """Which points (P,) a camera sees, from in front, and of these column and row."""
-    way = surface.point - camera.eye
-    distance = np.linalg.norm(way, axis=1)
-    before = way @ -camera.world_from_camera[:3, 2] > 1e-6 * distance
-    seen = before & ((surface.normal * way).sum(axis=1) < -MIN_COSINE * distance)
-    place = np.full((len(way), 2), -1.0)
-    place[seen] = camera.project(surface.point[seen])
-    cell = np.floor(place)
-    limit = np.array([camera.width, camera.height]) - 2
-    seen &= ((cell >= 1) & (cell <= limit)).all(axis=1)
-    directions = np.ascontiguousarray(way[seen] / distance[seen, None], np.float32)
-    origins = np.broadcast_to(camera.eye, directions.shape)
-    if len(directions):
-        hits = rays.closest(np.ascontiguousarray(origins, np.float32), directions)
+    count, size = len(surface.point), (camera.width, camera.height)
+    cell, direction = np.full((count, 2), -1, np.int64), np.empty((count, 3), np.float32)
+    distance = np.empty(count)
+    _in_front(surface.point, surface.normal, Projection.of(camera), size, cell, direction, distance)
+    seen = cell[:, 0] >= 0
+    if seen.any():
+        hits = rays.closest(camera.eye[None].astype(np.float32), direction[seen])
         free = (hits.face < 0) | (hits.distance >= (1 - _SLACK) * distance[seen])
         seen[np.flatnonzero(seen)[~free]] = False
-    column, row = cell[seen].astype(np.int64).T
+    column, row = cell[seen].T
     return seen, column, row
+
+
+@loop
+def _in_front(
+    point: Double, normal: Double, camera: Projection, size: tuple[int, int], cell: Long,
+    direction: Float, distance: Double,
+) -> None:  # fmt: skip
+    """Column and row, unit direction and distance of what faces the camera in its picture, but for
+    its outermost pixels."""
+    m, (fx, fy, cx, cy) = camera.camera_from_world, camera.intrinsics
+    for k in range(len(point)):
+        p, n = point[k], normal[k]
+        wx, wy, wz = p[0] - camera.eye[0], p[1] - camera.eye[1], p[2] - camera.eye[2]
+        far = np.sqrt(wx * wx + wy * wy + wz * wz)
+        depth = -(m[2, 0] * p[0] + m[2, 1] * p[1] + m[2, 2] * p[2] + m[2, 3])
+        towards = n[0] * wx + n[1] * wy + n[2] * wz
+        if not (depth > 1e-6 * far and towards < -MIN_COSINE * far):
+            continue
+        x = m[0, 0] * p[0] + m[0, 1] * p[1] + m[0, 2] * p[2] + m[0, 3]
+        y = m[1, 0] * p[0] + m[1, 1] * p[1] + m[1, 2] * p[2] + m[1, 3]
+        column, row = np.floor(cx + fx * x / depth), np.floor(cy - fy * y / depth)
+        if 1 <= column <= size[0] - 2 and 1 <= row <= size[1] - 2:
+            cell[k, 0], cell[k, 1] = int(column), int(row)
+            direction[k, 0], direction[k, 1], direction[k, 2] = wx / far, wy / far, wz / far
+            distance[k] = far
 
 
 class Agreement(NamedTuple):

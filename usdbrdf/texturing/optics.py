@@ -16,6 +16,7 @@ import numpy as np
 
 from usdbrdf import calibration
 from usdbrdf.files.frames import FramePixels
+from usdbrdf.kernel import loop
 from usdbrdf.model.arrays import Bool, Double, Float, Int, Long
 from usdbrdf.model.camera import Camera
 from usdbrdf.texturing.agreement import MeshPoints, seen_points
@@ -89,9 +90,11 @@ def falloff_of_frames(samples: Samples) -> Falloff | None:
     known &= (known.sum(axis=1) > 1)[:, None]
     if int(known.sum()) < _FEWEST:
         return None
-    radius2 = samples.radius2.astype(np.float64)
+    # Of what no two frames show nothing is told.
+    shared = np.flatnonzero(known.any(axis=1))
+    part, value, known = shared % _PARTS, value[shared], known[shared]
+    radius2 = samples.radius2[shared].astype(np.float64)
     whole = _coefficients(value, radius2, known)
-    part = np.arange(len(value)) % _PARTS
     of_parts = [part == k for k in range(_PARTS)]
     parts = [sum(_coefficients(value[own], radius2[own], known[own])) for own in of_parts]
     error = float(np.std(parts, ddof=1)) / math.sqrt(_PARTS)
@@ -118,11 +121,28 @@ def _coefficients(value: Double, radius2: Double, known: Bool) -> tuple[float, f
 def _without_means(value: Double, weight: Double) -> Double:
     """(P, N) less what rows and columns have in common."""
     of_row, of_column = (np.maximum(weight.sum(axis=axis), 1e-12) for axis in (1, 0))
-    left = value
+    left = value.copy()
     for _ in range(_TURNS):
-        left = left - ((weight * left).sum(axis=1) / of_row)[:, None]
-        left = left - (weight * left).sum(axis=0) / of_column
+        _take_means(weight, of_row, of_column, left)
     return left
+
+
+@loop
+def _take_means(weight: Double, of_row: Double, of_column: Double, left: Double) -> None:
+    """Off each number what its row has in common, and of what is left what its column has."""
+    in_column = np.zeros(len(of_column))
+    for i in range(len(left)):
+        in_row = 0.0
+        for j in range(len(in_column)):
+            in_row += weight[i, j] * left[i, j]
+        in_row /= of_row[i]
+        for j in range(len(in_column)):
+            left[i, j] -= in_row
+            in_column[j] += weight[i, j] * left[i, j]
+    in_column /= of_column
+    for i in range(len(left)):
+        for j in range(len(in_column)):
+            left[i, j] -= in_column[j]
 
 
 def balance_drift(samples: Samples, owner: Int) -> Double | None:

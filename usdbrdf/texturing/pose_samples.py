@@ -94,6 +94,16 @@ def _smooth(first: int, last: int, picture: Float, out: Float) -> None:
     for j in range(first, last):
         for i in range(width):
             total, weight = 0.0, 0.0
+            if 0 < j < height - 1 and 0 < i < width - 1:
+                # Most pixels: all about them are known, which this sum alone tells.
+                for b in range(3):
+                    for a in range(3):
+                        own = (2.0 if a == 1 else 1.0) * (2.0 if b == 1 else 1.0)
+                        total += own * picture[j - 1 + b, i - 1 + a]
+                if not np.isnan(total):
+                    out[j, i] = total / 16
+                    continue
+                total = 0.0
             for b in range(max(j - 1, 0), min(j + 2, height)):
                 for a in range(max(i - 1, 0), min(i + 2, width)):
                     own = (2.0 if a == i else 1.0) * (2.0 if b == j else 1.0)
@@ -113,8 +123,11 @@ def _look_up(
     for k in range(first, last):
         p, n = point[k], normal[k]
         wx, wy, wz = camera.eye[0] - p[0], camera.eye[1] - p[1], camera.eye[2] - p[2]
+        towards = n[0] * wx + n[1] * wy + n[2] * wz
+        if towards <= 0:  # half of all, which need no root
+            continue
         distance = np.sqrt(wx * wx + wy * wy + wz * wz)
-        cosine = (n[0] * wx + n[1] * wy + n[2] * wz) / max(distance, 1e-30)
+        cosine = towards / max(distance, 1e-30)
         x = m[0, 0] * p[0] + m[0, 1] * p[1] + m[0, 2] * p[2] + m[0, 3]
         y = m[1, 0] * p[0] + m[1, 1] * p[1] + m[1, 2] * p[2] + m[1, 3]
         z = m[2, 0] * p[0] + m[2, 1] * p[1] + m[2, 2] * p[2] + m[2, 3]

@@ -13,10 +13,6 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
-from trimesh.exchange.gltf import load_glb
-from trimesh.exchange.obj import load_obj
-from trimesh.exchange.ply import load_ply
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.atomic import raise_shortage
@@ -221,6 +217,8 @@ def _mesh_from_ply(file: BinaryIO) -> FileMesh:
 
 
 def _mesh_from_obj(file: BinaryIO) -> FileMesh:
+    from trimesh.exchange.obj import load_obj  # takes a tenth of a second that PLY files need not
+
     content = plain_obj(file.read())
     try:
         whole, names, part = parts_of_obj(obj_of_convex_faces(content))
@@ -255,6 +253,8 @@ def _mesh_from_glb(file: BinaryIO) -> FileMesh:
             f"{file.name}: {said}, which is not read here. Export it again as plain triangles, "
             "posed and without compression, or convert it to PLY. [mesh.format]"
         )
+    import trimesh
+
     refuse_promises(document)
     scene = trimesh.load_scene(file, file_type="glb", process=False)
     parts = []
@@ -317,8 +317,11 @@ def read_model_here(path: Path) -> tuple[list[Surface], list[str]]:
 
 
 def _surfaces(path: Path, file: BinaryIO) -> tuple[list[Surface], list[str]]:
-    beside = _FilesBeside(path)
-    load: Any = {".ply": load_ply, ".obj": load_obj, ".glb": load_glb}[path.suffix.lower()]
+    import trimesh
+
+    beside, of = _FilesBeside(path), trimesh.exchange
+    loaders = {".ply": of.ply.load_ply, ".obj": of.obj.load_obj, ".glb": of.gltf.load_glb}
+    load: Any = loaders[path.suffix.lower()]
     if path.suffix.lower() == ".obj":
         file = BytesIO(obj_of_convex_faces(plain_obj(file.read())))
     if path.suffix.lower() == ".ply":

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
+from usdbrdf.kernel import parallel_kernel
 from usdbrdf.model.arrays import Double, Float
 from usdbrdf.model.camera import Camera
 from usdbrdf.model.mesh import ScanMesh
@@ -63,11 +63,10 @@ class Pattern:
         """The picture as it would be without the pattern."""
         if self == Pattern():
             return picture
-        half = half_diagonal(camera)
-        middle = np.array(camera.intrinsics[2:])
-        at = half * self.places((camera.pixels() - middle) / half) + middle - 0.5
-        grid = at[:, ::-1].T.reshape(2, *picture.shape)
-        return np.asarray(map_coordinates(picture, grid, order=1, cval=np.nan), np.float32)
+        changed = np.empty(picture.shape, np.float32)
+        numbers = math.exp(self.zoom), self.bend, self.right, self.down
+        _move(len(picture), picture, numbers, half_diagonal(camera), camera.intrinsics[2:], changed)
+        return changed
 
     def by_number(self, camera: Camera, points: Double) -> Double:
         """(S, 2, 4) of small patterns."""
@@ -75,6 +74,32 @@ class Pattern:
         bent = place * (place**2).sum(axis=1, keepdims=True)
         right, down = (np.broadcast_to(side, place.shape) for side in np.eye(2))
         return np.stack([place, bent, right, down], axis=2)
+
+
+@parallel_kernel
+def _move(
+    first: int, last: int, picture: Float, numbers: tuple[float, float, float, float],
+    half: float, middle: tuple[float, float], changed: Float,
+) -> None:  # fmt: skip
+    """What a picture has, between its pixels' centres, where the ``places`` of a pattern are; NaN
+    beyond its border, or beside a pixel that is."""
+    (zoom, bend, right, down), (cx, cy) = numbers, middle
+    height, width = picture.shape
+    for j in range(first, last):
+        y = (j + 0.5 - cy) / half
+        for i in range(width):
+            x = (i + 0.5 - cx) / half
+            factor = zoom * (1 + bend * (x * x + y * y))
+            u = half * (factor * x + right) + cx - 0.5
+            v = half * (factor * y + down) + cy - 0.5
+            if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+                changed[j, i] = np.nan
+                continue
+            column, row = min(int(u), width - 2), min(int(v), height - 2)
+            a, b = u - column, v - row
+            upper = (1 - a) * picture[row, column] + a * picture[row, column + 1]
+            lower = (1 - a) * picture[row + 1, column] + a * picture[row + 1, column + 1]
+            changed[j, i] = (1 - b) * upper + b * lower
 
 
 def lens_of_frames(
