@@ -7,9 +7,11 @@ import re
 import stat
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from usdbrdf.errors import EnvironmentFailure, InputRefused, OwnershipConflict
+from usdbrdf.files.naming import composed
 
 _URI = re.compile(r"^(?:[a-z][a-z0-9+.\-]+://|(?:file|data):)", re.IGNORECASE)
 _ABSOLUTE = re.compile(r"^(?:[/\\~]|[A-Za-z]:[/\\])")  # POSIX, UNC, home, Windows drive
@@ -179,6 +181,30 @@ def files_below(folder: Path, *, without: Path) -> list[Path]:
         and path.is_file()
         and not (whole / path.relative_to(folder)).is_relative_to(own)
     )
+
+
+@dataclass(frozen=True)
+class OtherLetters:
+    """What lies below a folder, to be asked for by paths that documents write in other letters."""
+
+    root: Path
+    _there: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
+
+    def of(self, path: Path) -> Path:
+        """The path itself where something is there or it does not lie below the root; else the only
+        one whose names differ in nothing but case and how accents are written; else the path."""
+        if path == self.root or not path.is_relative_to(self.root) or os.path.lexists(path):
+            return path
+        alike = self._in(self.of(path.parent)).get(composed(path.name).lower(), [])
+        return alike[0] if len(alike) == 1 else path
+
+    def _in(self, folder: Path) -> dict[str, list[Path]]:
+        if folder not in self._there:
+            of_name = self._there[folder] = {}
+            for path in folder.iterdir() if folder.is_dir() else ():
+                if not path.is_symlink():  # it may lead out
+                    of_name.setdefault(composed(path.name).lower(), []).append(path)
+        return self._there[folder]
 
 
 def seen_of(found: Iterable[Path], *, below: Path | None = None) -> list[Path]:

@@ -24,7 +24,7 @@ from usdbrdf.errors import ImageRefused, InputRefused, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
 from usdbrdf.files.naming import composed, ends_of, meant_by, must_be_undistorted, number_at_end
-from usdbrdf.files.paths import AS_JPEG, contained, is_heif, seen_of
+from usdbrdf.files.paths import AS_JPEG, OtherLetters, contained, is_heif, seen_of
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
@@ -232,6 +232,8 @@ class Pictured:
     _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
     _refused: list[InputRefused] = field(default_factory=list)
 
+    _letters = cached_property(lambda self: OtherLetters(self.folder))
+
     def of(self, name: str, below: str = "") -> Path | None:
         """The picture called ``name`` in the folder ``below``: the file of this name, else the one
         there whose name differs in nothing but case and kind of picture, radiance first; of a
@@ -276,14 +278,23 @@ class Pictured:
         return nearest
 
     def file(self, name: str, *, fewest: int = 1) -> Path:
-        """Another file that the document names, which need not be there, with what leads out taken
-        alike, by an end of ``fewest`` parts or more."""
+        """Another file that the document names, which need not be there; else the only one whose
+        path differs in case alone; of what leads out that at an end of ``fewest`` parts or more."""
+
+        def look(path: Path) -> Path | None:
+            return found if (found := self._letters.of(path)).is_file() else None
+
+        path_of = name if os.path.lexists(self.folder / name) else name.replace("\\", "/")
         try:
-            return path_in_capture(self.folder, name, self.options)
+            path = path_in_capture(self.folder, path_of, self.options)
         except InputRefused:
-            if found := self._at_end_of(name, lambda p: p if p.is_file() else None, fewest):
+            if found := self._at_end_of(name, look, fewest):
                 return found
             raise
+        found = look(path) or path
+        if composed(found.name) != composed(path.name):
+            self.otherwise[name] = found
+        return found
 
     def _at_end_of(
         self, path: str, look: Callable[[Path], Path | None], fewest: int = 1
@@ -327,20 +338,10 @@ class Pictured:
     def _in_folder(self, folder: Path) -> dict[str, list[Path]]:
         if folder not in self._listed:
             of_stem = self._listed[folder] = {}
-            place = self._folder_called(folder)
+            place = self._letters.of(folder)
             for path in _below(place, deep=False).paths if place.is_dir() else ():
                 of_stem.setdefault(composed(path.stem).lower(), []).append(path)
         return self._listed[folder]
-
-    def _folder_called(self, folder: Path) -> Path:
-        """A folder of the capture, else the only one there whose name differs in case alone."""
-        if folder.is_dir() or not folder.is_relative_to(self.folder):
-            return folder
-        above, name = self._folder_called(folder.parent), composed(folder.name).lower()
-        there = above.iterdir() if above.is_dir() else ()
-        # No links: they may lead out.
-        alike = [p for p in there if composed(p.name).lower() == name and not p.is_symlink()]
-        return alike[0] if len(alike) == 1 and alike[0].is_dir() else folder
 
 
 def _kind_of_file(path: Path) -> str:
