@@ -24,7 +24,7 @@ from usdbrdf.errors import ImageRefused, InputRefused, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
 from usdbrdf.files.naming import composed, ends_of, meant_by, must_be_undistorted, number_at_end
-from usdbrdf.files.paths import AS_JPEG, OtherLetters, contained, is_heif, seen_of
+from usdbrdf.files.paths import AS_JPEG, OtherLetters, contained, is_heif, seen_of, without_copies
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
@@ -79,16 +79,17 @@ class Pictures:
         return path and _or_radiance(path, [p for p, _ in candidates], self.instead)
 
     def of_each_name(self) -> tuple[Path, ...]:
-        """One picture of each name: of a photograph with radiance beside it that. All of them where
-        two of one name are of one kind."""
+        """One picture of each name: of a photograph with radiance beside it that; without copies.
+        All of these where two of one name are of one kind."""
         alike: dict[Path, list[Path]] = {}
-        for path in self.paths:
+        originals = without_copies(self.paths)
+        for path in originals:
             alike.setdefault(path.with_suffix(""), []).append(path)
         chosen: list[Path] = []
         instead: dict[Path, Path] = {}
         for some in alike.values():
             if (best := nearest_to_radiance(some)) is None:
-                return self.paths
+                return originals
             chosen.append(best)
             if _is_radiance(best):
                 instead.update((p, best) for p in some if p.suffix.lower() in _PHOTOGRAPHS)
@@ -127,13 +128,9 @@ class Pictures:
         """The pictures by the number at the end of their names, those without left out; of two of
         one number the one that is nearer to radiance."""
         found: dict[int, list[Path]] = {}
-        for path in self.paths:
+        for path in without_copies(self.paths):
             found.setdefault(number_at_end(path.stem), []).insert(0, path)
         return {i: _nearest(alike)[0] for i, alike in sorted(found.items()) if i >= 0}
-
-
-def _nearness(path: Path) -> int:
-    return SUFFIXES.index(path.suffix.lower())
 
 
 def nearest_to_radiance(found: Sequence[Path]) -> Path | None:
@@ -150,8 +147,8 @@ def _nearest(found: Sequence[Path]) -> Sequence[Path]:
         return found
     kinds = {path: _kind_of_colours(path) for path in found}
     found = [path for path in found if kinds[path]] or found
-    best = min(map(_nearness, found))
-    found = [path for path in found if _nearness(path) == best]
+    nearness = {path: SUFFIXES.index(path.suffix.lower()) for path in found}
+    found = [path for path in found if nearness[path] == min(nearness.values())]
     return [path for path in found if kinds[path] == max(kinds[path] for path in found)]
 
 
