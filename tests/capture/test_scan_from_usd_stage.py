@@ -682,3 +682,21 @@ def test_a_camera_named_by_its_picture_and_suffix_takes_no_other_picture(tmp_pat
     scan = read_scan(tmp_path / "shot", IngestOptions())
     assert_same(scan, room)
     assert "A0.exr" in [path.name for path in scan.frames.image_paths]
+
+
+@pytest.mark.parametrize("states", [True, False])
+def test_a_stage_in_metres_that_does_not_say_so_is_told(tmp_path, room, states):
+    """USD takes centimetres then, of which the room would be a toy."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room, unit=1.0)
+    many_cameras(stage, room)
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    if not states:
+        stage.ClearMetadata("metersPerUnit")
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "images" / f"IMG_{i:03d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert scan.meters_per_unit == 0.01
+    said = [sentence for sentence in scan.warnings if "[capture.unit]" in sentence]
+    assert len(said) == (not states)
+    assert states or "State --meters-per-unit 1 if it is" in said[0]

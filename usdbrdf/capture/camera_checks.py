@@ -17,8 +17,9 @@ from usdbrdf.errors import InputRefused
 from usdbrdf.files.exif import exif_focal_lengths, exif_lights
 from usdbrdf.geometry.sides import Sides
 from usdbrdf.model.arrays import Double
-from usdbrdf.model.capture import Frames
+from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.options import CaptureOptions
 from usdbrdf.transport.rays import RayScene
 
 _MIN_BASELINE = 1e-3  # of the scene's diagonal
@@ -34,6 +35,10 @@ _MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
 # Stops by which stated exposures may differ from those of the headers, and times by which focal
 # lengths may: names on dials are rounded, pictures of films cropped.
 _EXIF_STOPS, _EXIF_TIMES = 1 / 3, 1.3
+# Metres from cameras to what they see, in rooms and before things; and those beyond which they are
+# neither, without a doubt. Units in which coordinates are written, the likelier first.
+_ROOM, _NEAREST, _FARTHEST = (0.3, 12.0), 0.03, 60.0
+_LIKELY_UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
 
@@ -106,6 +111,42 @@ def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> floa
         f"{source}: only {share:.0%} of the camera rays hit the mesh (limit "
         f"{_MIN_HIT_SHARE:.0%}). {cure}. [capture.convention]"
     )
+
+
+def with_doubts_about_unit(scan: Scan, options: CaptureOptions, *, stated: bool) -> Scan:
+    """A scan, with a sentence where nobody has stated its unit and it is of no room's size and no
+    thing's in the one that is taken, but in another; nothing is rescaled."""
+    if stated or options.meters_per_unit or any("[capture.unit]" in w for w in scan.warnings):
+        return scan
+    unit, size = scan.meters_per_unit, np.ptp(scan.mesh.points.astype(np.float64), axis=0)
+    if _NEAREST < unit * np.linalg.norm(size) / 2 < _FARTHEST:
+        return scan
+    distance = _distance(RayScene(scan.mesh.points, scan.mesh.triangles), scan.frames)
+    likely = (n for n in _LIKELY_UNITS if _ROOM[0] <= _LIKELY_UNITS[n] * distance <= _ROOM[1])
+    name = next(likely, None)
+    if name is None or _NEAREST < unit * distance < _FARTHEST:
+        return scan
+    found = _LIKELY_UNITS[name]
+    whole, likely_whole = (
+        f"{' x '.join(f'{length:.3g}' for length in size * one)} m" for one in (unit, found)
+    )
+    said = (
+        f"{scan.source.name}: states no unit, and one of {unit:g} m is taken, so that the mesh is "
+        f"{whole} large and cameras stand {unit * distance:.3g} m from what they see, as in one of "
+        f"{likely_whole} if it is in {name}. State --meters-per-unit {found:g} if it is. "
+        "[capture.unit]"
+    )
+    return replace(scan, warnings=(*scan.warnings, said))
+
+
+def _distance(scene: RayScene, frames: Frames) -> float:
+    """Middle of how far cameras are from what they see; NaN where they see nothing."""
+    found = []
+    for i in spread_evenly(len(frames), _PROBED_FRAMES):
+        hits = scene.closest(*frames.camera(i).rays(_probes() * frames.resolution[i]))
+        found.append(hits.distance[hits.face >= 0])
+    seen = np.concatenate(found)
+    return float(np.median(seen)) if len(seen) else math.nan
 
 
 def warn_of_rolling_shutter(source: Path, findings: Findings) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.camera_checks import warn_of_rolling_shutter
+from usdbrdf.capture.camera_checks import warn_of_rolling_shutter, with_doubts_about_unit
 from usdbrdf.capture.checks import Findings, FrameRecord
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
@@ -88,7 +88,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         how="Export the model (File > Export > Export Model) in the coordinate system of the "
         "cameras into this folder",
     )
-    return scan_of(
+    scan = scan_of(
         records,
         mesh,
         options,
@@ -98,6 +98,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         folder=folder,
         up_axis=up_axis_assumed(records, options, findings, source.name),
     )
+    return with_doubts_about_unit(scan, options, stated=scan.usd_geometry is not None)
 
 
 @dataclass(frozen=True, kw_only=True)

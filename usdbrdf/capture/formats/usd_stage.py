@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.camera_checks import with_doubts_about_unit
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.formats.named_pictures import (
     Pictured,
@@ -101,7 +102,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             )
         return geometry_from_usd(stage, options, findings, capture_root=folder, subsets=True)
 
-    return scan_of(
+    scan = scan_of(
         records,
         geometry,
         options,
@@ -113,6 +114,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         meters_per_unit=found.meters_per_unit,
         up_axis=found.up_axis,
     )
+    return with_doubts_about_unit(scan, options, stated=found.states_unit)
 
 
 def _records(
