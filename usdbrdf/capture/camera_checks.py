@@ -16,7 +16,7 @@ from usdbrdf.capture.conventions import CONVENTIONS, UNITS
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.exif import exif_focal_lengths, exif_lights
 from usdbrdf.geometry.sides import Sides
-from usdbrdf.model.arrays import Double
+from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ScanMesh
 from usdbrdf.options import CaptureOptions
@@ -257,6 +257,11 @@ def _framed_share(scene: RayScene, frames: Frames) -> float:
         inside = ((pixels >= 0) & (pixels <= frames.resolution[i])).all(axis=1)
         shares.append(float(inside.sum()) / len(points))
     return float(np.mean(shares))
+
+
+def hit_share(points: Float, triangles: Int, frames: Frames) -> float:
+    """Of the rays of some frames those that hit a mesh, (V, 3) and (F, 3)."""
+    return _hit_share(RayScene(points, triangles), frames, lambda pose: pose)
 
 
 def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]) -> float:

@@ -4,8 +4,9 @@ cameras a document stands whose own mesh is that of the scene."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from usdbrdf.errors import InputRefused, MeshMissing, first_of
 from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double, Float, Int, Long
-from usdbrdf.model.mesh import ObjectName, ScanMesh
+from usdbrdf.model.mesh import ObjectName, ScanGeometry, ScanMesh
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import colmap_points
 from usdbrdf.untrusted.mesh_files import LABEL_PROPERTY, FileMesh, mesh_from_file
@@ -124,6 +125,25 @@ def scene_above(document: Path) -> Path | None:
     kind, camera = document.parent.name, document.parent.parent.name
     apart = kind in ("nerfstudio", "colmap") and camera in _OF_SCANNETPP
     return scene if apart and (scene / "scans").is_dir() else None
+
+
+def moved_geometry(
+    read: Callable[[CaptureOptions], ScanGeometry],
+    matrix: Double,
+    options: CaptureOptions,
+    meters_per_unit: float,
+) -> ScanGeometry:
+    """What ``read`` makes of a mesh with options whose unit is the mesh's own, by a similarity
+    (4, 4) to the frame of a capture of ``meters_per_unit``, unless the options say it."""
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    unit = (options.meters_per_unit or meters_per_unit) * scale
+    found = read(replace(options, meters_per_unit=unit))
+    points = found.mesh.points @ matrix[:3, :3].T + matrix[:3, 3]
+    normals = found.mesh.corner_normals @ (matrix[:3, :3].T / scale)
+    moved = replace(
+        found.mesh, points=points.astype(np.float32), corner_normals=normals.astype(np.float32)
+    )
+    return replace(found, mesh=moved)
 
 
 class Lies(NamedTuple):
