@@ -14,7 +14,7 @@ import numpy as np
 from usdbrdf.capture.checks import Findings, FrameRecord, spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS, UNITS
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.exif import exif_focal_lengths, exif_lights
+from usdbrdf.files.exif import Headers, exif_focal_lengths, exif_lights
 from usdbrdf.geometry.sides import Sides
 from usdbrdf.model.arrays import Double, Float, Int
 from usdbrdf.model.capture import Frames, Scan
@@ -158,17 +158,23 @@ def warn_of_rolling_shutter(source: Path, findings: Findings) -> None:
 
 
 def doubts_about_headers(
-    records: Sequence[FrameRecord], source: Path, *, exposures_are_stated: bool
+    records: Sequence[FrameRecord],
+    source: Path,
+    headers: Headers | None = None,
+    *,
+    exposures_are_stated: bool,
 ) -> Iterator[str]:
     """A sentence where the exposures that a capture states of its photographs, or their focal
     lengths, are not those of their EXIF data. What all exposures have in common does not count."""
     if exposures_are_stated:
-        yield from _exposures_told_otherwise(records, source)
-    yield from _lenses_told_otherwise(records, source)
+        yield from _exposures_told_otherwise(records, source, headers)
+    yield from _lenses_told_otherwise(records, source, headers)
 
 
-def _exposures_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
-    lights = exif_lights([record.image_path for record in records])
+def _exposures_told_otherwise(
+    records: Sequence[FrameRecord], source: Path, headers: Headers | None
+) -> Iterator[str]:
+    lights = exif_lights([record.image_path for record in records], headers)
     told = [record for record in records if record.image_path in lights]
     if not told:
         return
@@ -188,7 +194,9 @@ def _exposures_told_otherwise(records: Sequence[FrameRecord], source: Path) -> I
         )
 
 
-def _lenses_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
+def _lenses_told_otherwise(
+    records: Sequence[FrameRecord], source: Path, headers: Headers | None
+) -> Iterator[str]:
     """By the photographs' middle: of one alone the header may be another's. A whole sphere has no
     focal length, whatever the headers say, which are those of the pictures that it was made of."""
     known = []
@@ -196,7 +204,7 @@ def _lenses_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iter
         if record.lens.curve == "equirectangular":
             continue
         stated = math.sqrt(math.prod(record.intrinsics[:2]))
-        if told := exif_focal_lengths(record.image_path, *record.resolution):
+        if told := exif_focal_lengths(record.image_path, *record.resolution, headers):
             off = np.abs(np.log(stated / np.array(told)))
             known.append((stated, told[int(off.argmin())]))
     if not known:
