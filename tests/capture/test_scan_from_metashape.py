@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -559,3 +560,36 @@ def test_a_georeferenced_chunk_has_its_model_in_its_own_coordinates(project, roo
     poses[:, :3, :3] = turn @ poses[:, :3, :3]
     poses[:, :3, 3] = (poses[:, :3, 3] - SHIFT) @ turn.T
     assert_same(scan, room, points=(room.points - SHIFT) @ turn.T, poses=poses, names=room.names)
+
+
+@pytest.mark.parametrize("name", ["IMAGES", "Photos K\u00fcche", "day 1/DCIM/100CANON"])
+def test_pictures_are_found_in_the_only_folder_that_holds_any(project, room, name):
+    (project / "images").rename(project / "moved")
+    (project / name).parent.mkdir(parents=True, exist_ok=True)
+    (project / "moved").rename(project / name)
+    write_image(project / "Masks_" / "DSC0000.png", np.ones((HEIGHT, WIDTH, 3), np.float32))
+    (project / "empty").mkdir()
+    assert_same(read_scan(project, OPTIONS), room, names=room.names)
+
+
+def test_of_two_folders_nobody_knows_which_holds_the_pictures(project):
+    (project / "images").rename(project / "one")
+    write_image(project / "two" / "DSC0000.jpg", np.ones((HEIGHT, WIDTH, 3), np.float32))
+    with pytest.raises(InputRefused, match=r"no pictures below .*--frames\. \[capture.frames\]"):
+        read_scan(project, OPTIONS)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_links_to_pictures_elsewhere_say_how_to_name_these(project, room, tmp_path, whole):
+    """That there were none was told, or to put the file inside."""
+    (project / "images").rename(tmp_path / "card")
+    if whole:
+        (project / "images").symlink_to(tmp_path / "card")
+    else:
+        (project / "images").mkdir()
+        for file in (tmp_path / "card").iterdir():
+            (project / "images" / file.name).symlink_to(file)
+    with pytest.raises(InputRefused, match="Name the folder that the pictures themselves lie in"):
+        read_scan(project, OPTIONS)
+    given = replace(OPTIONS, frames=tmp_path / "card")
+    assert_same(read_scan(project, given), room, names=room.names)

@@ -4,6 +4,7 @@ cameras a document stands whose own mesh is that of the scene."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -36,6 +37,8 @@ _FITS = 0.05
 # Folders of a scene of ScanNet++, which hold nerfstudio/ and colmap/.
 _OF_SCANNETPP = ("dslr", "iphone")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
+_MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
+_CALLED_MASKS = ("mask", "masks")
 _UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
 
 
@@ -77,9 +80,28 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
 
 def folder_of_masks(folder: Path) -> str:
     """The folder masks, else one that is called nearly so, if it holds anything; "" without one."""
-    alike = [p for p in seen_of(folder.iterdir()) if p.name.lower().strip("_") in ("mask", "masks")]
+    alike = [p for p in seen_of(folder.iterdir()) if p.name.lower().strip("_") in _CALLED_MASKS]
     alike.sort(key=lambda place: place.name != "masks")
     return next((p.name for p in alike if p.is_dir() and any(seen_of(p.iterdir()))), "")
+
+
+def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None:
+    """The mask of a picture in masks/, of its name there (in subfolders too), with its suffix or
+    not; black is what is not to be looked at."""
+    stem = str(PurePosixPath(name).with_suffix(""))
+    for usual in (name, stem, f"{stem}_mask", f"{name}.mask"):
+        for suffix in _MASK_SUFFIXES:
+            # Of which nothing can be asked, as of too long a name, is not there.
+            if os.path.isfile(folder / "masks" / f"{usual}{suffix}"):
+                return path_in_capture(folder, f"masks/{usual}{suffix}", options)
+    same = folder / "masks" / name
+    return path_in_capture(folder, f"masks/{name}", options) if os.path.isfile(same) else None
+
+
+def folders_but_masks(folder: Path) -> list[Path]:
+    """The folders in a folder that are no links and not called as those of masks are."""
+    there = (p for p in seen_of(folder.iterdir()) if p.is_dir() and not p.is_symlink())
+    return [p for p in there if p.name.lower().strip("_") not in _CALLED_MASKS]
 
 
 def labels_of_others(mesh: Path) -> str:

@@ -13,7 +13,13 @@ from pathlib import Path, PurePosixPath
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
 from usdbrdf.capture.develop import with_rims
-from usdbrdf.capture.mesh_frames import LabelTable, folder_of_masks, path_in_capture
+from usdbrdf.capture.mesh_frames import (
+    LabelTable,
+    folder_of_masks,
+    folders_but_masks,
+    mask_beside,
+    path_in_capture,
+)
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
@@ -41,9 +47,9 @@ _PHOTOGRAPHS, _RADIANCE = frozenset((".jpg", ".jpeg")) | _OF_CAMERAS, (".exr", "
 FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
 # Of documents that name pictures where they lay on another machine.
 _OTHER_FOLDER = "Name the folder of the pictures with --frames, or name them relative to this one"
+_LINKED = "Name the folder that the pictures themselves lie in with --frames"
 _THERE = "It is there: allow its folder with --allow-outside, or put the file inside this one"
 _LETTERS: tuple[Callable[[str], str], ...] = (str, str.lower)  # in which names are compared
-_MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,8 +193,9 @@ def warn_of_radiance(instead: Mapping[Path, Path], findings: Findings, source: P
 
 
 def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
-    """The pictures of a capture: of ``--frames``, else of the first of the ``usual`` folders (or of
-    those that most programs use) that holds any."""
+    """The pictures of a capture: of ``--frames``, else of the first of the ``usual`` folders that
+    holds any, also if its name differs in case; without these of the first of those that most
+    programs use, else of the only folder that holds any but masks."""
     if options.frames is not None:
         if not options.frames.is_dir():
             raise UsageError(
@@ -196,11 +203,15 @@ def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
                 "[usage.option]"
             )
         return _below(options.frames.resolve(), deep=True)
+    called = OtherLetters(folder)
     for name in usual or FOLDERS:
-        place = path_in_capture(folder, name, options) if name else folder
+        place = path_in_capture(folder, name, options, cure=_LINKED) if name else folder
+        place = called.of(place)
         if place.is_dir() and (found := _below(place, deep=bool(name))).paths:
             return found
-    return Pictures(folder=folder, paths=())
+    others = (_below(p, deep=True) for p in folders_but_masks(folder)) if not usual else ()
+    holding = [found for found in others if found.paths]
+    return holding[0] if len(holding) == 1 else Pictures(folder=folder, paths=())
 
 
 def _below(folder: Path, *, deep: bool) -> Pictures:
@@ -355,19 +366,6 @@ def _names_without_suffix(name: str) -> tuple[str, ...]:
     return (stem,) if kind in SUFFIXES else (name,)
 
 
-def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None:
-    """The mask of a picture in masks/, of its name there (in subfolders too), with its suffix or
-    not; black is what is not to be looked at."""
-    stem = str(PurePosixPath(name).with_suffix(""))
-    for usual in (name, stem, f"{stem}_mask", f"{name}.mask"):
-        for suffix in _MASK_SUFFIXES:
-            # Of which nothing can be asked, as of too long a name, is not there.
-            if os.path.isfile(folder / "masks" / f"{usual}{suffix}"):
-                return path_in_capture(folder, f"masks/{usual}{suffix}", options)
-    same = folder / "masks" / name
-    return path_in_capture(folder, f"masks/{name}", options) if os.path.isfile(same) else None
-
-
 def drop_without_picture(label: str, findings: Findings) -> None:
     """Leave out a camera whose picture was not found."""
     findings.drop(label, "no picture, or more than one, has this name", "capture.file")
@@ -376,8 +374,12 @@ def drop_without_picture(label: str, findings: Findings) -> None:
 def refuse_without_pictures(pictures: Pictures, source: Path) -> None:
     """InputRefused where no picture was found at all."""
     if not pictures.paths:
-        found = (p for p in seen_of(pictures.folder.rglob("*")) if p.suffix.lower() in _HEIF)
+        there = seen_of(pictures.folder.rglob("*"))
         how = ". Put them beside it in a folder images, or name their folder with --frames"
+        links = (p for p in there if p.is_symlink() and p.suffix.lower() in SUFFIXES)
+        if link := next(links, None):
+            how = f": {link.name} is a link that leads out of it, or nowhere. {_LINKED}"
+        found = (p for p in there if p.suffix.lower() in _HEIF)
         if heif := next(filter(is_heif, found), None):
             how = f" that are read: {heif.name} is {AS_JPEG}"
         raise InputRefused(f"{source}: no pictures below {pictures.folder}{how}. [capture.frames]")
