@@ -660,3 +660,19 @@ def test_an_address_leads_no_farther_than_a_name(made, name):
     _rename(made, name)
     with pytest.raises(InputRefused):
         _read(made)
+
+
+@pytest.mark.parametrize("named", ["Masks/{:04d}.PNG", "D:\\shoot\\Masks\\{:04d}.PNG"])
+def test_masks_are_found_by_other_spellings_of_their_names(made, named):
+    _rename(made, "frames/{:04d}.exr")
+    with edited(made.manifest) as document:
+        for i, frame in enumerate(document["frames"]):
+            frame["mask_path"] = named.format(i)
+            white = np.full((24, 32, 1), 255, np.uint8)
+            white[:, :16] = 0
+            _write_bytes(made.folder / f"masks/{i:04d}.png", white)
+    scan = _read(made)
+    assert scan.views
+    assert {view.mask for view in scan.views} == {
+        made.folder / f"masks/{i:04d}.png" for i in range(12)
+    }

@@ -62,3 +62,35 @@ def test_the_unit_that_would_fit_is_named(tmp_path, larger, rule, unit, axes):
         write_ply(made.folder / "mesh.ply", made.points / larger, made.triangles, made.face_object)
     with pytest.raises(InputRefused, match=rf"{unit} .*\[capture\.{rule}\]$"):
         read_scan(made.folder, IngestOptions())
+
+
+@pytest.mark.parametrize(
+    ("times", "stated", "told"),
+    [
+        (100.0, {}, "0.01 if it is"),
+        (1000.0, {}, "0.001 if it is"),
+        (100.0, {"meters_per_unit": 1.0}, ""),
+        (1.0, {}, ""),
+        (5.0, {}, ""),
+    ],
+)
+def test_a_room_of_hundreds_of_metres_whose_unit_is_not_stated_is_told(
+    tmp_path, times, stated, told
+):
+    """In centimetres, most likely; what is stated is believed, and nothing is rescaled."""
+    made = make_capture(tmp_path / "scan", subdivisions=1)
+    with edited(made.manifest) as document:
+        document.pop("meters_per_unit", None)
+        document.update(stated)
+        for frame in document["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, 3] *= times
+            frame["transform_matrix"] = pose.tolist()
+    write_ply(made.folder / "mesh.ply", made.points * times, made.triangles, made.face_object)
+    scan = read_scan(made.folder, IngestOptions())
+    said = [sentence for sentence in scan.warnings if "[capture.unit]" in sentence]
+    assert len(said) == bool(told)
+    assert told in "".join(said)
+    assert scan.meters_per_unit == 1.0
+    given = read_scan(made.folder, IngestOptions(meters_per_unit=1.0))
+    assert not any("[capture.unit]" in sentence for sentence in given.warnings)

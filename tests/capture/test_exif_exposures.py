@@ -13,7 +13,9 @@ import pytest
 from tests.scenes import edited, make_capture
 from usdbrdf.capture.adapters import read_scan
 from usdbrdf.capture.camera_checks import doubts_about_headers
-from usdbrdf.capture.checks import FrameRecord
+from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.parts import as_photographs
+from usdbrdf.files import exif
 from usdbrdf.files.exif import Settings, exif_settings
 from usdbrdf.model.lens import Lens
 from usdbrdf.options import IngestOptions
@@ -181,3 +183,31 @@ def test_headers_are_held_against_what_they_are_of(tmp_path):
     )
     assert len(told(lambda i: 1.0)) == 1
     assert told(lambda i: 1.0, lens=Lens(curve="equirectangular")) == []
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_headers_are_read_once(tmp_path, monkeypatch, stated):
+    records = _records(tmp_path, stated)
+    opened = []
+
+    def counted(path, names):
+        opened.append(path)
+        return [None] * len(names)
+
+    monkeypatch.setattr(exif, "header_of", counted)
+    as_photographs(records, Findings(), tmp_path)
+    assert sorted(opened) == sorted(record.image_path for record in records)
+
+
+def _records(folder: Path, stated: bool) -> list[FrameRecord]:
+    return [
+        FrameRecord(
+            name=str(i),
+            image_path=folder / f"{i}.jpg",
+            world_from_camera=np.eye(4),
+            intrinsics=(30, 30, 16, 12),
+            resolution=(32, 24),
+            exposure_time=1 + i * stated,
+        )
+        for i in range(3)
+    ]

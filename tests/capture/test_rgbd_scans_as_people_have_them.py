@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import Pictures
 from usdbrdf.capture.reconstructions import rgbd_scans
 from usdbrdf.errors import InputRefused
+from usdbrdf.files.paths import without_copies
 
 
 @pytest.mark.parametrize(
@@ -188,3 +190,44 @@ def test_pictures_of_another_size_are_told_with_what_helps(tmp_path):
     _write_stray(tmp_path, replace(room, images=[np.rot90(i) for i in room.images]))
     with pytest.raises(InputRefused, match=r"Use the images that the intrinsics.*capture\.size\]$"):
         read_scan(tmp_path, OPTIONS)
+
+
+# A copy of picture i, beside it or in a folder below, of whatever size.
+_COPIES = (
+    "{0} (1)", "{0} - Copy", "{0} copy 2", "{0}_small", "thumb_{0}", "thumbs/{0}", "old.bak/{0}",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("copy", _COPIES)
+@pytest.mark.parametrize("every", [True, False])
+def test_copies_of_pictures_are_no_frames(tmp_path, copy, every):
+    """Beside as many as there are poses, and in the place of one that was deleted, which was taken
+    for it with all poses behind it off by one."""
+    room = truth()
+    _write_stray(tmp_path, room)
+    for i in range(10) if every else (3,):
+        path = tmp_path / "rgb" / f"{copy.format(f'{i:06d}')}.jpg"
+        write_image(path, room.images[(i + 5) % 10][::2, ::2])
+    if not every:
+        (tmp_path / "rgb/000006.jpg").unlink()
+    kept = [i for i in range(10) if every or i != 6]
+    few = replace(room, images=[room.images[i] for i in kept], intrinsics=room.intrinsics[kept])
+    expected = {"points": _turned(room)["points"], "poses": _turned(room)["poses"][kept]}
+    scan = read_scan(tmp_path, OPTIONS)
+    assert_same(scan, few, **expected)
+    assert any("have no camera, first" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["image", *(f"image ({i})" for i in range(1, 9))],
+        [*(f"{i}_rgb" for i in range(9)), *map(str, range(9))],
+        ["left/1", "1", "right/1"],
+        ["1305031102.175304", "1305031102", "1305031102.211"],
+        ["1_2", "1", "2"],
+    ],
+)
+def test_what_is_called_alike_need_not_be_a_copy(names):
+    paths = tuple(Path(f"/scan/rgb/{name}.jpg") for name in names)
+    assert without_copies(paths) == paths

@@ -146,3 +146,13 @@ def test_what_is_missing_is_named(tmp_path):
     (place / "lowres_wide.traj").write_text("1 2 3\n")
     with pytest.raises(InputRefused, match="not rows of a time and six numbers"):
         read_scan(tmp_path, OPTIONS)
+
+
+@pytest.mark.parametrize("copy", ["{} (1)", "thumb_{}", "thumbs/{}", "backup/{}_edited"])
+def test_copies_of_pictures_are_no_frames(tmp_path, copy):
+    room = truth()
+    place = _write(tmp_path, room)
+    for i in range(10):
+        name = copy.format(f"{VIDEO}_{_time(i):.3f}")
+        write_image(place / "lowres_wide" / f"{name}.png", room.images[(i + 5) % 10][::2, ::2])
+    assert_same(read_scan(tmp_path, OPTIONS), room)

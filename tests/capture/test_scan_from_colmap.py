@@ -14,7 +14,7 @@ from tests.scenes import edited, make_capture, write_ply
 from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.capture.checks import FrameRecord
 from usdbrdf.capture.formats import colmap
-from usdbrdf.capture.formats.named_pictures import mask_beside
+from usdbrdf.capture.mesh_frames import mask_beside
 from usdbrdf.capture.up_axis import up_axis_of
 from usdbrdf.errors import EnvironmentFailure, InputRefused
 from usdbrdf.files.images import read_exr, write_exr

@@ -150,3 +150,16 @@ def test_what_is_up_need_not_be_square_to_the_view(photographed, room, tilt):
     frames = read_scan(photographed, IngestOptions()).frames
     # No nearer than what the rounding turns.
     np.testing.assert_allclose(frames.world_from_camera, room.world_from_camera, atol=1e-3)
+
+
+def test_names_in_other_letters_than_the_data_set_has(photographed, room):
+    """As copies through other systems have them; of the segmentation too."""
+    scan = read_scan(photographed, IngestOptions())
+    for folder in ("Image", "segmentation"):
+        for file in (photographed / folder).iterdir():
+            file.rename(file.with_suffix(".EXR"))
+    (photographed / "Image").rename(photographed / "image")
+    other = read_scan(photographed, IngestOptions())
+    assert_same(other, room)
+    assert [label.label for label in other.objects] == [label.label for label in scan.objects]
+    assert any("20 pictures of other names" in said for said in other.warnings)

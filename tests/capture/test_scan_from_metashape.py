@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -505,3 +506,90 @@ def test_refusals(project, damage, sentence):
 def test_a_folder_of_two_exports_is_one_of_metashape(project):
     _exported_twice(project)
     assert choose_adapter(project).name == "metashape"
+
+
+def _write_region(project, room):
+    """As Metashape writes it: centre, size and axes of a box in the chunk's coordinates."""
+    document = ET.parse(project / "cameras.xml")
+    points = (room.points - SHIFT) @ TURN / SCALE
+    axes = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    inner = points @ axes
+    low, high = inner.min(axis=0), inner.max(axis=0)
+    region = _child(document.getroot().find("chunk"), "region")
+    _child(region, "center", _text(axes @ (low + high) / 2))
+    _child(region, "size", _text((high - low) * 1.1))
+    _child(region, "R", _text(axes))
+    document.write(project / "cameras.xml")
+
+
+@pytest.mark.parametrize("region", [True, False])
+@pytest.mark.parametrize("unit", [1.0, SCALE])
+def test_a_model_in_the_chunks_own_coordinates_is_brought_to_the_cameras(
+    project, room, region, unit
+):
+    """Rays were said to miss it, or to hit one in another unit; or it was taken as it lay."""
+    if region:
+        _write_region(project, room)
+    write_obj(project / "model.obj", room, (room.points - SHIFT) @ TURN / SCALE * unit)
+    scan = read_scan(project, OPTIONS)
+    assert_same(scan, room, names=room.names)
+    (said,) = (said for said in scan.warnings if "[mesh.frame]" in said)
+    assert f"{SCALE / unit:.3g} times as large" in said
+
+
+def test_a_model_where_the_transform_leads_stays_there(project, room):
+    _write_region(project, room)
+    scan = read_scan(project, OPTIONS)
+    assert_same(scan, room, names=room.names)
+    assert not any("[mesh.frame]" in said for said in scan.warnings)
+
+
+def test_a_georeferenced_chunk_has_its_model_in_its_own_coordinates(project, room):
+    """In which the cameras are read then, in metres, z up."""
+    _write_region(project, room)
+    document = ET.parse(project / "cameras.xml")
+    up = np.array([4157222.5, 664789.3, 4774952.1])
+    document.getroot().find("chunk/transform/translation").text = _text(up)
+    document.write(project / "cameras.xml")
+    write_obj(project / "model.obj", room, (room.points - SHIFT) @ TURN / SCALE)
+    scan = read_scan(project, OPTIONS)
+    up, east = up / np.linalg.norm(up), np.cross([0, 0, 1], up)
+    east /= np.linalg.norm(east)
+    turn = np.stack([east, np.cross(up, east), up])
+    poses = room.world_from_camera.copy()
+    poses[:, :3, :3] = turn @ poses[:, :3, :3]
+    poses[:, :3, 3] = (poses[:, :3, 3] - SHIFT) @ turn.T
+    assert_same(scan, room, points=(room.points - SHIFT) @ turn.T, poses=poses, names=room.names)
+
+
+@pytest.mark.parametrize("name", ["IMAGES", "Photos K\u00fcche", "day 1/DCIM/100CANON"])
+def test_pictures_are_found_in_the_only_folder_that_holds_any(project, room, name):
+    (project / "images").rename(project / "moved")
+    (project / name).parent.mkdir(parents=True, exist_ok=True)
+    (project / "moved").rename(project / name)
+    write_image(project / "Masks_" / "DSC0000.png", np.ones((HEIGHT, WIDTH, 3), np.float32))
+    (project / "empty").mkdir()
+    assert_same(read_scan(project, OPTIONS), room, names=room.names)
+
+
+def test_of_two_folders_nobody_knows_which_holds_the_pictures(project):
+    (project / "images").rename(project / "one")
+    write_image(project / "two" / "DSC0000.jpg", np.ones((HEIGHT, WIDTH, 3), np.float32))
+    with pytest.raises(InputRefused, match=r"no pictures below .*--frames\. \[capture.frames\]"):
+        read_scan(project, OPTIONS)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_links_to_pictures_elsewhere_say_how_to_name_these(project, room, tmp_path, whole):
+    """That there were none was told, or to put the file inside."""
+    (project / "images").rename(tmp_path / "card")
+    if whole:
+        (project / "images").symlink_to(tmp_path / "card")
+    else:
+        (project / "images").mkdir()
+        for file in (tmp_path / "card").iterdir():
+            (project / "images" / file.name).symlink_to(file)
+    with pytest.raises(InputRefused, match="Name the folder that the pictures themselves lie in"):
+        read_scan(project, OPTIONS)
+    given = replace(OPTIONS, frames=tmp_path / "card")
+    assert_same(read_scan(project, given), room, names=room.names)

@@ -643,3 +643,60 @@ def test_frames_that_a_format_does_not_ask_for_are_refused(tmp_path):
         read_scan(export, options)
     with pytest.raises(UsageError, match=r"no such folder.*\[usage.option\]"):
         read_scan(tmp_path / "capture", options)
+
+
+@pytest.mark.parametrize(
+    ("plate", "file", "told"),
+    [
+        ("./plates/P.####.EXR", "plates/p.{:04d}.exr", "10 pictures of other names"),
+        ("./Plates/p.####.exr", "plates/p.{:04d}.exr", ""),
+        ("D:\\shoot\\plates\\p.####.exr", "plates/p.{:04d}.exr", "lie elsewhere"),
+        ("./plates/p.####.jpg", "plates/p.{:04d}.exr", "10 pictures of other names"),
+    ],
+)
+def test_plates_are_found_by_other_spellings_of_their_names(tmp_path, room, plate, file, told):
+    """As the pictures are that other documents name."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    moving_camera(stage, room)
+    named_plate(stage.GetPrimAtPath("/room/camera")).Set(Sdf.AssetPath(plate))
+    stage.Save()
+    for i, pixels in enumerate(room.images):
+        write_image(tmp_path / "shot" / file.format(101 + i), pixels)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room)
+    warnings = [said for said in scan.warnings if "[capture.file]" in said or "moved]" in said]
+    assert len(warnings) == bool(told)
+    assert not told or told in warnings[0]
+
+
+def test_a_camera_named_by_its_picture_and_suffix_takes_no_other_picture(tmp_path, room):
+    """A stray copy NAME.exr.exr has the suffix in its stem."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room)
+    for i, pose in enumerate(room.world_from_camera):
+        camera = UsdGeom.Camera.Define(stage, f"/shots/A{i}_exr")
+        camera.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
+        _set_lens(camera, room.intrinsics[i])
+        write_image(tmp_path / "shot" / "images" / f"A{i}.exr", room.images[i])
+    stage.Save()
+    write_image(tmp_path / "shot" / "images" / "A0.exr.exr", room.images[5])
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert_same(scan, room)
+    assert "A0.exr" in [path.name for path in scan.frames.image_paths]
+
+
+@pytest.mark.parametrize("states", [True, False])
+def test_a_stage_in_metres_that_does_not_say_so_is_told(tmp_path, room, states):
+    """USD takes centimetres then, of which the room would be a toy."""
+    stage = make_stage(tmp_path / "shot" / "room.usda", room, unit=1.0)
+    many_cameras(stage, room)
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    if not states:
+        stage.ClearMetadata("metersPerUnit")
+    stage.Save()
+    for i, image in enumerate(room.images):
+        write_image(tmp_path / "shot" / "images" / f"IMG_{i:03d}.exr", image)
+    scan = read_scan(tmp_path / "shot", IngestOptions())
+    assert scan.meters_per_unit == 0.01
+    said = [sentence for sentence in scan.warnings if "[capture.unit]" in sentence]
+    assert len(said) == (not states)
+    assert states or "State --meters-per-unit 1 if it is" in said[0]

@@ -407,6 +407,29 @@ def test_obj_may_be_written_in_other_ways(tmp_path, written):
     assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
+_PLY_OF_SQUARE = (
+    "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+    "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    "0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
+)
+
+
+@pytest.mark.parametrize("name", ["square.obj", "square.ply"])
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-16-le", "utf-8-sig"])
+def test_text_of_meshes_may_be_in_utf_16(tmp_path, name, encoding):
+    """As PowerShell's > and editors of Windows write it, with a mark or without."""
+    path = tmp_path / name
+    text = _PLY_OF_SQUARE if name.endswith("ply") else f"{_SQUARE}o K\u00fcche\nf 1 2 3\nf 1 3 4\n"
+    path.write_text(text, encoding=encoding)
+    assert mesh_from_file(path).triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
+    (surface,) = model_from_file(path)
+    assert len(surface.triangles) == 2
+    if encoding == "utf-16":
+        path.write_bytes(path.read_bytes()[:-1])
+        with pytest.raises(InputRefused, match=r"text in UTF-16 that breaks off.*\[mesh\.read\]$"):
+            mesh_from_file(path)
+
+
 @pytest.mark.parametrize("face", ["f 0 1 2", "f 1/1 2/1 0/1", "f -1 -2 -5"])
 def test_obj_faces_with_vertices_before_the_first_are_refused(tmp_path, face):
     (tmp_path / "from_0.obj").write_text(_SQUARE + face + "\n")

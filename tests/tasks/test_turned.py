@@ -129,3 +129,23 @@ def test_images_that_lie_for_cameras_that_stand_are_refused(tmp_path):
     made = _photographed(_room(tmp_path, (48, 32)), 6, upright=True)
     with pytest.raises(InputRefused, match=r"EXIF data turn it.*\[capture\.size\]$"):
         _read(made)
+
+
+def _say_sides_as_stored(made: MadeCapture) -> None:
+    """As who reads the size from the file, and everything else from who turned the pictures."""
+    with edited(made.manifest) as document:
+        for owner in (document, *document["frames"]):
+            if "w" in owner:
+                owner["w"], owner["h"] = owner["h"], owner["w"]
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_sizes_as_stored_beside_lenses_of_upright_images_tell_nothing(tmp_path, orientation):
+    """Lying images for standing cameras, whose principal points say so: they were used, which told
+    that frames do not agree."""
+    made = _photographed(_room(tmp_path, (48, 36)), orientation, upright=True)
+    _say_sides_as_stored(made)
+    assert len(_read(made).turned_images) == 12
+    said = _refusals(made)
+    assert "the poses are those of upright ones" in said
+    assert said.endswith("and state their size as it is then. [capture.orientation]")

@@ -14,11 +14,12 @@ import numpy as np
 from usdbrdf.capture.checks import Findings, FrameRecord, spread_evenly
 from usdbrdf.capture.conventions import CONVENTIONS, UNITS
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.exif import exif_focal_lengths, exif_lights
+from usdbrdf.files.exif import Headers, exif_focal_lengths, exif_lights
 from usdbrdf.geometry.sides import Sides
-from usdbrdf.model.arrays import Double
-from usdbrdf.model.capture import Frames
+from usdbrdf.model.arrays import Double, Float, Int
+from usdbrdf.model.capture import Frames, Scan
 from usdbrdf.model.mesh import ScanMesh
+from usdbrdf.options import CaptureOptions
 from usdbrdf.transport.rays import RayScene
 
 _MIN_BASELINE = 1e-3  # of the scene's diagonal
@@ -34,6 +35,10 @@ _MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
 # Stops by which stated exposures may differ from those of the headers, and times by which focal
 # lengths may: names on dials are rounded, pictures of films cropped.
 _EXIF_STOPS, _EXIF_TIMES = 1 / 3, 1.3
+# Metres from cameras to what they see, in rooms and before things; and those beyond which they are
+# neither, without a doubt. Units in which coordinates are written, the likelier first.
+_ROOM, _NEAREST, _FARTHEST = (0.3, 12.0), 0.03, 60.0
+_LIKELY_UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8
 
@@ -108,6 +113,42 @@ def refuse_rays_that_miss(frames: Frames, scene: RayScene, source: Path) -> floa
     )
 
 
+def with_doubts_about_unit(scan: Scan, options: CaptureOptions, *, stated: bool) -> Scan:
+    """A scan, with a sentence where nobody has stated its unit and it is of no room's size and no
+    thing's in the one that is taken, but in another; nothing is rescaled."""
+    if stated or options.meters_per_unit or any("[capture.unit]" in w for w in scan.warnings):
+        return scan
+    unit, size = scan.meters_per_unit, np.ptp(scan.mesh.points.astype(np.float64), axis=0)
+    if _NEAREST < unit * np.linalg.norm(size) / 2 < _FARTHEST:
+        return scan
+    distance = _distance(RayScene(scan.mesh.points, scan.mesh.triangles), scan.frames)
+    likely = (n for n in _LIKELY_UNITS if _ROOM[0] <= _LIKELY_UNITS[n] * distance <= _ROOM[1])
+    name = next(likely, None)
+    if name is None or _NEAREST < unit * distance < _FARTHEST:
+        return scan
+    found = _LIKELY_UNITS[name]
+    whole, likely_whole = (
+        f"{' x '.join(f'{length:.3g}' for length in size * one)} m" for one in (unit, found)
+    )
+    said = (
+        f"{scan.source.name}: states no unit, and one of {unit:g} m is taken, so that the mesh is "
+        f"{whole} large and cameras stand {unit * distance:.3g} m from what they see, as in one of "
+        f"{likely_whole} if it is in {name}. State --meters-per-unit {found:g} if it is. "
+        "[capture.unit]"
+    )
+    return replace(scan, warnings=(*scan.warnings, said))
+
+
+def _distance(scene: RayScene, frames: Frames) -> float:
+    """Middle of how far cameras are from what they see; NaN where they see nothing."""
+    found = []
+    for i in spread_evenly(len(frames), _PROBED_FRAMES):
+        hits = scene.closest(*frames.camera(i).rays(_probes() * frames.resolution[i]))
+        found.append(hits.distance[hits.face >= 0])
+    seen = np.concatenate(found)
+    return float(np.median(seen)) if len(seen) else math.nan
+
+
 def warn_of_rolling_shutter(source: Path, findings: Findings) -> None:
     """One sentence, the same for all formats that state one."""
     findings.warn(
@@ -117,17 +158,23 @@ def warn_of_rolling_shutter(source: Path, findings: Findings) -> None:
 
 
 def doubts_about_headers(
-    records: Sequence[FrameRecord], source: Path, *, exposures_are_stated: bool
+    records: Sequence[FrameRecord],
+    source: Path,
+    headers: Headers | None = None,
+    *,
+    exposures_are_stated: bool,
 ) -> Iterator[str]:
     """A sentence where the exposures that a capture states of its photographs, or their focal
     lengths, are not those of their EXIF data. What all exposures have in common does not count."""
     if exposures_are_stated:
-        yield from _exposures_told_otherwise(records, source)
-    yield from _lenses_told_otherwise(records, source)
+        yield from _exposures_told_otherwise(records, source, headers)
+    yield from _lenses_told_otherwise(records, source, headers)
 
 
-def _exposures_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
-    lights = exif_lights([record.image_path for record in records])
+def _exposures_told_otherwise(
+    records: Sequence[FrameRecord], source: Path, headers: Headers | None
+) -> Iterator[str]:
+    lights = exif_lights([record.image_path for record in records], headers)
     told = [record for record in records if record.image_path in lights]
     if not told:
         return
@@ -147,7 +194,9 @@ def _exposures_told_otherwise(records: Sequence[FrameRecord], source: Path) -> I
         )
 
 
-def _lenses_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iterator[str]:
+def _lenses_told_otherwise(
+    records: Sequence[FrameRecord], source: Path, headers: Headers | None
+) -> Iterator[str]:
     """By the photographs' middle: of one alone the header may be another's. A whole sphere has no
     focal length, whatever the headers say, which are those of the pictures that it was made of."""
     known = []
@@ -155,7 +204,7 @@ def _lenses_told_otherwise(records: Sequence[FrameRecord], source: Path) -> Iter
         if record.lens.curve == "equirectangular":
             continue
         stated = math.sqrt(math.prod(record.intrinsics[:2]))
-        if told := exif_focal_lengths(record.image_path, *record.resolution):
+        if told := exif_focal_lengths(record.image_path, *record.resolution, headers):
             off = np.abs(np.log(stated / np.array(told)))
             known.append((stated, told[int(off.argmin())]))
     if not known:
@@ -216,6 +265,11 @@ def _framed_share(scene: RayScene, frames: Frames) -> float:
         inside = ((pixels >= 0) & (pixels <= frames.resolution[i])).all(axis=1)
         shares.append(float(inside.sum()) / len(points))
     return float(np.mean(shares))
+
+
+def hit_share(points: Float, triangles: Int, frames: Frames) -> float:
+    """Of the rays of some frames those that hit a mesh, (V, 3) and (F, 3)."""
+    return _hit_share(RayScene(points, triangles), frames, lambda pose: pose)
 
 
 def _hit_share(scene: RayScene, frames: Frames, read: Callable[[Double], Double]) -> float:

@@ -27,6 +27,7 @@ from usdbrdf.files.images import (
 )
 from usdbrdf.job.progress import progress
 from usdbrdf.model.arrays import Bool, Double
+from usdbrdf.model.camera import is_of_turned
 from usdbrdf.model.capture import Frames
 from usdbrdf.model.lens import PINHOLE, Lens
 from usdbrdf.model.mesh import ScanGeometry
@@ -319,8 +320,7 @@ def at_image_size(
     """Records with the sizes of their images, and intrinsics that belong to these.
 
     Images that are larger or smaller than their intrinsics say, by one factor in both axes, have
-    the intrinsics scaled; frames with other sizes, or unreadable ones, are dropped. Images that
-    EXIF data turn go to ``findings.turned``.
+    these scaled; others, and unreadable ones, are dropped. Turned ones go to ``findings.turned``.
     """
     kept: list[FrameRecord] = []
     scaled: list[str] = []
@@ -340,7 +340,8 @@ def at_image_size(
             said += "; its EXIF data turn it, so save the images upright"
         elif orientation > 1:
             turned[record.image_path] = orientation
-            as_stored |= orientation > 4 and width != height and not record.size_of_image
+            told = not (record.size_of_image or is_of_turned(record.intrinsics, across, down))
+            as_stored |= orientation > 4 and width != height and told
         # Whoever scales an image rounds its sides to whole pixels.
         if abs(width * down - height * across) >= across:
             findings.drop(record.name, said, "capture.size")

@@ -4,8 +4,10 @@ cameras a document stands whose own mesh is that of the scene."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -16,7 +18,7 @@ from usdbrdf.errors import InputRefused, MeshMissing, first_of
 from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double, Float, Int, Long
-from usdbrdf.model.mesh import ObjectName, ScanMesh
+from usdbrdf.model.mesh import ObjectName, ScanGeometry, ScanMesh
 from usdbrdf.options import CaptureOptions
 from usdbrdf.untrusted.colmap_models import colmap_points
 from usdbrdf.untrusted.mesh_files import LABEL_PROPERTY, FileMesh, mesh_from_file
@@ -35,6 +37,8 @@ _FITS = 0.05
 # Folders of a scene of ScanNet++, which hold nerfstudio/ and colmap/.
 _OF_SCANNETPP = ("dslr", "iphone")
 _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
+_MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
+_CALLED_MASKS = ("mask", "masks")
 _UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
 
 
@@ -76,9 +80,28 @@ def mesh_beside(folder: Path, options: CaptureOptions, *usual: str, how: str) ->
 
 def folder_of_masks(folder: Path) -> str:
     """The folder masks, else one that is called nearly so, if it holds anything; "" without one."""
-    alike = [p for p in seen_of(folder.iterdir()) if p.name.lower().strip("_") in ("mask", "masks")]
+    alike = [p for p in seen_of(folder.iterdir()) if p.name.lower().strip("_") in _CALLED_MASKS]
     alike.sort(key=lambda place: place.name != "masks")
     return next((p.name for p in alike if p.is_dir() and any(seen_of(p.iterdir()))), "")
+
+
+def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None:
+    """The mask of a picture in masks/, of its name there (in subfolders too), with its suffix or
+    not; black is what is not to be looked at."""
+    stem = str(PurePosixPath(name).with_suffix(""))
+    for usual in (name, stem, f"{stem}_mask", f"{name}.mask"):
+        for suffix in _MASK_SUFFIXES:
+            # Of which nothing can be asked, as of too long a name, is not there.
+            if os.path.isfile(folder / "masks" / f"{usual}{suffix}"):
+                return path_in_capture(folder, f"masks/{usual}{suffix}", options)
+    same = folder / "masks" / name
+    return path_in_capture(folder, f"masks/{name}", options) if os.path.isfile(same) else None
+
+
+def folders_but_masks(folder: Path) -> list[Path]:
+    """The folders in a folder that are no links and not called as those of masks are."""
+    there = (p for p in seen_of(folder.iterdir()) if p.is_dir() and not p.is_symlink())
+    return [p for p in there if p.name.lower().strip("_") not in _CALLED_MASKS]
 
 
 def labels_of_others(mesh: Path) -> str:
@@ -124,6 +147,25 @@ def scene_above(document: Path) -> Path | None:
     kind, camera = document.parent.name, document.parent.parent.name
     apart = kind in ("nerfstudio", "colmap") and camera in _OF_SCANNETPP
     return scene if apart and (scene / "scans").is_dir() else None
+
+
+def moved_geometry(
+    read: Callable[[CaptureOptions], ScanGeometry],
+    matrix: Double,
+    options: CaptureOptions,
+    meters_per_unit: float,
+) -> ScanGeometry:
+    """What ``read`` makes of a mesh with options whose unit is the mesh's own, by a similarity
+    (4, 4) to the frame of a capture of ``meters_per_unit``, unless the options say it."""
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    unit = (options.meters_per_unit or meters_per_unit) * scale
+    found = read(replace(options, meters_per_unit=unit))
+    points = found.mesh.points @ matrix[:3, :3].T + matrix[:3, 3]
+    normals = found.mesh.corner_normals @ (matrix[:3, :3].T / scale)
+    moved = replace(
+        found.mesh, points=points.astype(np.float32), corner_normals=normals.astype(np.float32)
+    )
+    return replace(found, mesh=moved)
 
 
 class Lies(NamedTuple):

@@ -34,7 +34,7 @@ from usdbrdf.capture.rigid_poses import rigid_records
 from usdbrdf.errors import InputRefused, MeshMissing, UsageError, UsdBrdfError
 from usdbrdf.files.colour import kind_of_encoding, known_encodings, unknown_encoding
 from usdbrdf.files.documents import read_json
-from usdbrdf.files.exif import exif_exposures
+from usdbrdf.files.exif import Headers, exif_exposures
 from usdbrdf.files.frames import PHOTOGRAPH_ENCODING, photograph_limits
 from usdbrdf.files.images import MAX_SIDE
 from usdbrdf.files.naming import unique_identifiers
@@ -447,10 +447,10 @@ def as_photographs(
 ) -> list[FrameRecord]:
     """8-bit sRGB records with the limits of such images, brought to one exposure: the stated one,
     else that of all images' EXIF data."""
-    told = ""
+    told, headers = "", Headers()
     stated = any(record.exposure_time != 1 for record in records)
     if not stated:
-        known, any_told = exif_exposures([record.image_path for record in records])
+        known, any_told = exif_exposures([record.image_path for record in records], headers)
         if known:
             records = [
                 replace(record, exposure_time=exposure)
@@ -467,7 +467,7 @@ def as_photographs(
         f"{source.name}: the images are photographs, so the result is not radiometric: "
         f"colours and relative brightness only.{told} [capture.ldr]"
     )
-    for doubt in doubts_about_headers(records, source, exposures_are_stated=stated):
+    for doubt in doubts_about_headers(records, source, headers, exposures_are_stated=stated):
         findings.warn(doubt)
     saturation, noise_floor = photograph_limits(np.array([r.exposure_time for r in records]))
     return [

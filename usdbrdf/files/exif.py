@@ -28,6 +28,26 @@ _FOCAL, _ZOOM = "Exif:FocalLengthIn35mmFilm", "Exif:DigitalZoomRatio"
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 
 
+class Headers:
+    """Headers of photographs, each of which is opened once for all that is asked of it here."""
+
+    def __init__(self) -> None:
+        self._said: dict[Path, dict[str, object] | ImageRefused] = {}
+
+    def of(self, path: Path, names: Sequence[str]) -> list[object]:
+        """As ``header_of`` says it, which raises ImageRefused."""
+        if path not in self._said:
+            asked = (*_NAMES, _FOCAL, _ZOOM)
+            try:
+                self._said[path] = dict(zip(asked, header_of(path, asked), strict=True))
+            except ImageRefused as error:
+                self._said[path] = error
+        said = self._said[path]
+        if isinstance(said, ImageRefused):
+            raise said
+        return [said[name] for name in names]
+
+
 class Settings(NamedTuple):
     """Seconds, f-number and ISO speed of a photograph, None where they are not told."""
 
@@ -44,12 +64,12 @@ class Settings(NamedTuple):
         return self.time * (self.speed or 100) / 100 / (self.number or 1) ** 2
 
 
-def exif_settings(path: Path) -> Settings:
+def exif_settings(path: Path, headers: Headers | None = None) -> Settings:
     """What the EXIF data of a photograph say, in numbers or else in stops (APEX).
 
     A dial's 1/30 or 1/125 is a name: the shutter opens for 1/32 and 1/128. Where the shutter's
     speed in stops says so, that is taken, as a whole, half or third stop."""
-    said = dict(zip(_NAMES, header_of(path, _NAMES), strict=True))
+    said = dict(zip(_NAMES, (headers or Headers()).of(path, _NAMES), strict=True))
     time, stops = _positive(said[_TIME]), _finite(said[_STOPS])
     if said[_TIME] is not None and time is None and stops == 0:
         stops = None  # of who writes 0 for what is not known
@@ -70,30 +90,34 @@ def exif_exposure(path: Path) -> float | None:
     return exif_settings(path).light
 
 
-def exif_focal_lengths(path: Path, width: int, height: int) -> list[float]:
+def exif_focal_lengths(
+    path: Path, width: int, height: int, headers: Headers | None = None
+) -> list[float]:
     """Focal length, in pixels of the whole picture in that size, of a photograph whose EXIF data
     tell that of a camera for 35 mm film with as large an angle of view; of a digital zoom it may
     tell that before it or after, and both are returned. None are where they do not tell it, or the
     file cannot be read, of which the reader of its pixels will tell."""
     with suppress(ImageRefused):
-        said, zoom = map(_positive, header_of(path, [_FOCAL, _ZOOM]))
+        said, zoom = map(_positive, (headers or Headers()).of(path, [_FOCAL, _ZOOM]))
         if said is not None:
             pixels = said / _FILM_DIAGONAL_MM * math.hypot(width, height)
             return [pixels * times for times in {1.0, max(zoom or 1.0, 1.0)}]
     return []
 
 
-def exif_lights(paths: Sequence[Path]) -> dict[Path, float]:
+def exif_lights(paths: Sequence[Path], headers: Headers | None = None) -> dict[Path, float]:
     """The light of each of several photographs, see ``Settings.light``, but of those that cannot be
     read, of which the reader of their pixels will tell; none where it cannot be compared, as some
     tell a time, an f-number or a speed and others do not."""
-    return _comparable(_readable_settings(paths))
+    return _comparable(_readable_settings(paths, headers))
 
 
-def exif_exposures(paths: Sequence[Path]) -> tuple[list[float] | None, bool]:
+def exif_exposures(
+    paths: Sequence[Path], headers: Headers | None = None
+) -> tuple[list[float] | None, bool]:
     """The same of all of them, those that cannot be read with that of another, None where it cannot
     be compared; and whether any tells anything."""
-    known = _readable_settings(paths)
+    known = _readable_settings(paths, headers)
     lights = _comparable(known)
     other = next(iter(lights.values()), None)
     found = [lights.get(path, other) for path in paths]
@@ -122,11 +146,13 @@ def told_by_some(paths: Sequence[Path]) -> tuple[str, Path, Path] | None:
     return None
 
 
-def _readable_settings(paths: Sequence[Path]) -> dict[Path, Settings]:
+def _readable_settings(
+    paths: Sequence[Path], headers: Headers | None = None
+) -> dict[Path, Settings]:
     known: dict[Path, Settings] = {}
     for path in paths:
         with suppress(ImageRefused):
-            known[path] = exif_settings(path)
+            known[path] = exif_settings(path, headers)
     return known
 
 

@@ -74,3 +74,14 @@ class Camera:
         fx, fy, cx, cy = self.intrinsics
         x, y, depth = in_camera[:, 0], in_camera[:, 1], -in_camera[:, 2]
         return np.stack([cx + fx * x / depth, cy - fy * y / depth], axis=-1)
+
+
+def is_of_turned(
+    intrinsics: tuple[float, float, float, float], width: float, height: float
+) -> bool:
+    """Whether fx, fy, cx, cy are those of a picture of these sides that was turned by a quarter:
+    the axis lies nearer to the middle of that one."""
+    _, _, x, y = intrinsics
+    here = max(abs(x / width - 0.5), abs(y / height - 0.5))
+    there = max(abs(x / height - 0.5), abs(y / width - 0.5))
+    return bool(there < here)

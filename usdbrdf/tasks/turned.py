@@ -86,8 +86,8 @@ def refuse_turned(
         raise InputRefused(
             f"{said}the poses are those of upright ones: with these, what frames show at the same "
             f"points of the mesh differs by {as_upright.ratio:.0%} of what any two pixels do, and "
-            f"as stored they {differ}. Save the images upright (mogrify -auto-orient). "
-            "[capture.orientation]"
+            f"as stored they {differ}. Save the images upright (mogrify -auto-orient), and state "
+            "their size as it is then. [capture.orientation]"
         )
     raise InputRefused(
         f"{said}neither sizes nor pixels tell whether the poses are those of upright images. Save "

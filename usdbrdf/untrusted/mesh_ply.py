@@ -13,6 +13,7 @@ import numpy as np
 
 from usdbrdf.model.arrays import Array, Double, Long
 from usdbrdf.model.mesh import Triangulation, triangulate
+from usdbrdf.untrusted.mesh_text import in_utf8
 from usdbrdf.untrusted.ply_numbers import KINDS, Column, Numbers, Text, element, numbers_behind
 
 _NAMES = {kind: name for name, kind in reversed(KINDS.items())}
@@ -131,6 +132,7 @@ def _header(content: bytes) -> bytes:
 def ply_of(content: bytes) -> Ply:
     """What the bytes of a PLY say. ValueError for what is none, says less than it announces, or
     more: its numbers are not those that its header is for then."""
+    content = in_utf8(content)
     beginning = _BEGINNING.match(content)
     if beginning is None:
         raise ValueError("it does not begin with a line 'ply'")

@@ -23,15 +23,32 @@ _DIVIDER = re.compile(rb"^(o|g|usemtl)(?= |$)([^\n]*)", re.MULTILINE)
 _CONTINUED = re.compile(rb"^(?:[^\n]*\\\n)+[^\n]*", re.MULTILINE)
 
 
+def in_utf8(content: bytes) -> bytes:
+    """A file of text as it would be in UTF-8 without a mark: shells and editors of Windows write
+    UTF-16. Of any other file the bytes as they are. ValueError for UTF-16 that breaks off."""
+    if content.startswith(codecs.BOM_UTF8):
+        return content.removeprefix(codecs.BOM_UTF8)
+    is_marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    # No text of 8 bits has a NUL, and what these files begin with is ASCII.
+    little, big = content[1:4:2] == b"\0\0", content[0:3:2] == b"\0\0"
+    if not (is_marked or (little ^ big and content[:4].strip(b"\0"))):
+        return content
+    encoding = "utf-16" if is_marked else "utf-16-le" if little else "utf-16-be"
+    try:
+        return content.decode(encoding).encode()
+    except UnicodeError as error:
+        raise ValueError("text in UTF-16 that breaks off or is damaged") from error
+
+
 def plain_obj(content: bytes) -> bytes:
     """An OBJ all of whose faces count vertices from the first one on, line by line. Its format lets
     them count back from where they stand; trimesh would count from the end of the file. It would
     also pass over lines whose words tabs part, that are indented, that a CR alone ends or that a
-    mark of UTF-8 begins, and stumble over remarks.
+    mark of UTF-8 begins, and stumble over remarks; of UTF-16 it would find nothing.
 
     Raises ValueError for a vertex 0, which would be taken for the last one.
     """
-    content = content.removeprefix(codecs.BOM_UTF8).replace(b"\t", b" ") + b"\n"
+    content = in_utf8(content).replace(b"\t", b" ") + b"\n"
     if b"\r" in content:
         content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"\\\n" in content:

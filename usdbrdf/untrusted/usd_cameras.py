@@ -64,11 +64,13 @@ class UsdCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class UsdCameras:
-    """All perspective cameras of a stage, in its order, and the stage's unit and axis."""
+    """All perspective cameras of a stage, in its order, and the stage's unit and axis; whether it
+    states the unit, or has what USD takes then."""
 
     cameras: tuple[UsdCamera, ...]
     meters_per_unit: float
     up_axis: str
+    states_unit: bool
 
 
 def cameras_from_usd(path: Path, *, allow: Sequence[Path] = ()) -> UsdCameras:
@@ -97,7 +99,14 @@ def read_here(path: Path) -> tuple[UsdCameras]:
             f"{path}: {what}. Export the cameras of the photographs with the stage. [stage.camera]"
         )
     cameras = tuple(_camera(camera) for camera in sound)
-    return (UsdCameras(cameras=cameras, meters_per_unit=meters_per_unit, up_axis=up_axis),)
+    return (
+        UsdCameras(
+            cameras=cameras,
+            meters_per_unit=meters_per_unit,
+            up_axis=up_axis,
+            states_unit=UsdGeom.StageHasAuthoredMetersPerUnit(stage),
+        ),
+    )
 
 
 def _camera(camera: UsdGeom.Camera) -> UsdCamera:

@@ -29,8 +29,14 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord
-from usdbrdf.capture.formats.named_pictures import Pictured, mask_beside, scan_of
-from usdbrdf.capture.mesh_frames import mesh_beside, path_in_capture, scene_above, why_elsewhere
+from usdbrdf.capture.formats.named_pictures import Pictured, scan_of
+from usdbrdf.capture.mesh_frames import (
+    mask_beside,
+    mesh_beside,
+    path_in_capture,
+    scene_above,
+    why_elsewhere,
+)
 from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import ImageRefused, InputRefused

@@ -20,7 +20,7 @@ import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
-from usdbrdf.capture.formats.named_pictures import scan_of
+from usdbrdf.capture.formats.named_pictures import Pictured, scan_of
 from usdbrdf.capture.mesh_frames import LabelTable, mesh_beside
 from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.capture.up_axis import up_axis_assumed
@@ -52,17 +52,20 @@ def matches(path: Path) -> bool:
 
 def read(path: Path, options: CaptureOptions) -> Scan:
     folder, findings = path.resolve(), Findings()
+    pictured = Pictured(folder=folder, options=options)
     if (folder / "cam.txt").is_file():
-        source, records = folder / "cam.txt", _photographed(folder, findings)
+        source, records = folder / "cam.txt", _photographed(pictured, findings)
     elif (folder / "train").is_dir():
-        source, records = folder / "train" / "transforms.json", _rendered(folder, findings)
+        source, records = folder / "train" / "transforms.json", _rendered(pictured, findings)
     else:
         raise InputRefused(
             f"{folder}: neither cam.txt nor train/transforms.json. Name the scene's folder. "
             "[capture.format]"
         )
     mesh = partial(mesh_beside, folder, options, "scene.obj", "scene.ply", how=_HOW)
-    segmented = any(_segmentation_of(record).is_file() for record in records)
+    segmentations = [_segmentation_of(pictured, record) for record in records]
+    pictured.warn_of_others(findings, source)
+    segmented = any(map(Path.is_file, segmentations))
     return scan_of(
         records,
         mesh,
@@ -72,11 +75,12 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         source=source,
         folder=folder,
         up_axis=up_axis_assumed(records, options, findings, source.name),
-        objects=_voted(records) if segmented else None,
+        objects=_voted(records, segmentations) if segmented else None,
     )
 
 
-def _photographed(folder: Path, findings: Findings) -> list[FrameRecord]:
+def _photographed(pictured: Pictured, findings: Findings) -> list[FrameRecord]:
+    folder = pictured.folder
     cameras, lenses = _triples(folder / "cam.txt"), _triples(folder / "K_list.txt")
     if len(cameras) != len(lenses):
         raise InputRefused(
@@ -85,14 +89,14 @@ def _photographed(folder: Path, findings: Findings) -> list[FrameRecord]:
         )
     records = []
     for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True)):
-        image = folder / "Image" / f"{i:03d}_0001.exr"
+        image = f"Image/{i:03d}_0001.exr"
         origin, target, up = camera
         ahead = (target - origin) / (np.linalg.norm(target - origin) or 1.0)
         # Up is of three decimals in some files, or only roughly up: made square to the view.
         right = np.cross(ahead, up)
         right /= np.linalg.norm(right) or 1.0
         axes = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
-        record = _record(image, rigid_pose(axes, origin), lens, findings)
+        record = _record(pictured, image, rigid_pose(axes, origin), lens, findings)
         records += [record] if record else []
     return records
 
@@ -110,8 +114,8 @@ def _triples(path: Path) -> Double:
     return np.array(rows).reshape(-1, 3, 3)
 
 
-def _rendered(folder: Path, findings: Findings) -> list[FrameRecord]:
-    records = []
+def _rendered(pictured: Pictured, findings: Findings) -> list[FrameRecord]:
+    folder, records = pictured.folder, []
     for split in _SPLITS:
         path = folder / split / "transforms.json"
         if not path.is_file():
@@ -125,26 +129,26 @@ def _rendered(folder: Path, findings: Findings) -> list[FrameRecord]:
                 "[capture.format]"
             )
         for i, frame in enumerate(frames):
-            image = folder / split / "Image" / f"{i:03d}_0001.exr"
+            image = f"{split}/Image/{i:03d}_0001.exr"
             try:
                 pose = np.array(frame["transform_matrix"], np.float64)
                 pose = np.vstack([pose[:3, :4], [0, 0, 0, 1]])
             except (KeyError, TypeError, ValueError, IndexError):
-                findings.drop(f"{split}/{image.name}", "it has no 4 x 4 pose", "capture.pose")
+                findings.drop(image, "it has no 4 x 4 pose", "capture.pose")
                 continue
             # From x left, y up, looking down +z: half a turn about y.
             pose = pose @ np.diag([-1.0, 1, -1, 1])
-            record = _record(image, pose, angle, findings)
+            record = _record(pictured, image, pose, angle, findings)
             records += [record] if record else []
     return records
 
 
 def _record(
-    image: Path, pose: Double, lens: Double | float, findings: Findings
+    pictured: Pictured, name: str, pose: Double, lens: Double | float, findings: Findings
 ) -> FrameRecord | None:
     """lens is K, or the angle of view across."""
-    name = f"{image.parent.parent.name}/{image.name}"
-    if not image.is_file():
+    image = pictured.of(name)
+    if image is None:
         findings.drop(name, "the image file does not exist", "capture.file")
         return None
     try:
@@ -167,15 +171,18 @@ def _record(
     )
 
 
-def _segmentation_of(record: FrameRecord) -> Path:
-    number = record.image_path.name.partition("_")[0]
-    return record.image_path.parent.parent / "segmentation" / f"{number}.exr"
+def _segmentation_of(pictured: Pictured, record: FrameRecord) -> Path:
+    folder, number = record.name.split("Image/")
+    return pictured.file(f"{folder}segmentation/{number.partition('_')[0]}.exr")
 
 
-def _voted(records: Sequence[FrameRecord]) -> Callable[[FileMesh], LabelTable]:
+def _voted(
+    records: Sequence[FrameRecord], segmentations: Sequence[Path]
+) -> Callable[[FileMesh], LabelTable]:
     def objects(mesh: FileMesh) -> LabelTable:
         scene = RayScene(mesh.points, mesh.triangles)
-        votes = [vote for record in records for vote in _votes(record, scene)]
+        segmented = zip(records, segmentations, strict=True)
+        votes = [vote for record, path in segmented for vote in _votes(record, path, scene)]
         if not votes:
             return LabelTable({}, None)
         face, number = (np.concatenate(each) for each in zip(*votes, strict=True))
@@ -188,9 +195,8 @@ def _voted(records: Sequence[FrameRecord]) -> Callable[[FileMesh], LabelTable]:
     return objects
 
 
-def _votes(record: FrameRecord, scene: RayScene) -> list[tuple[Long, Long]]:
+def _votes(record: FrameRecord, path: Path, scene: RayScene) -> list[tuple[Long, Long]]:
     """Faces, and the number that a pixel which sees each has."""
-    path = _segmentation_of(record)
     if not path.is_file():
         return []
     number = read_exr(path)[..., 0]

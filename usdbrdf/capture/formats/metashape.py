@@ -10,7 +10,7 @@ OpenCV has them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.camera_checks import warn_of_rolling_shutter
-from usdbrdf.capture.checks import Findings, FrameRecord
+from usdbrdf.capture.camera_checks import hit_share, warn_of_rolling_shutter, with_doubts_about_unit
+from usdbrdf.capture.checks import Findings, FrameRecord, frames_from_records
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
     Pictures,
@@ -30,7 +30,8 @@ from usdbrdf.capture.formats.named_pictures import (
     warn_of_radiance,
     warn_of_unused,
 )
-from usdbrdf.capture.mesh_frames import mesh_beside
+from usdbrdf.capture.mesh_frames import mesh_beside, moved_geometry
+from usdbrdf.capture.parts import geometry_from_file
 from usdbrdf.capture.rigid_poses import rigid_pose
 from usdbrdf.capture.up_axis import up_axis_assumed
 from usdbrdf.errors import InputRefused
@@ -46,7 +47,10 @@ from usdbrdf.files.tables import (
 from usdbrdf.model.arrays import Double
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.lens import PINHOLE, Curve, Lens, whole_sphere
+from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
+from usdbrdf.untrusted.mesh_files import SUFFIXES as MESH_SUFFIXES
+from usdbrdf.untrusted.mesh_files import mesh_from_file
 
 NAME = "metashape"
 DESCRIPTION = DESCRIPTIONS[NAME]
@@ -57,6 +61,10 @@ _CURVES: dict[str, Curve] = {
 }
 # From the Earth's middle, in metres: nothing stands so far from the origin of its own coordinates.
 _GEOCENTRIC = 1e6
+# Of rays that hit a mesh where it is seen, as much as nowhere else, and times as many as elsewhere.
+_SEEN, _SEEN_WHOLE, _CLEARLY_MORE = 0.2, 0.9, 1.5
+# Of a mesh's vertices that lie in the region of its chunk, made larger; and of its size.
+_INSIDE, _SLACK, _FILLED = 0.9, 1.05, 0.2
 
 
 def matches(path: Path) -> bool:
@@ -79,18 +87,9 @@ def read(path: Path, options: CaptureOptions) -> Scan:
     records = frame_records(source, pictures, options, findings)
     warn_of_radiance(pictures.instead, findings, source)
     warn_of_unused(pictures, (r.image_path for r in records), findings, source)
-    mesh = partial(
-        mesh_beside,
-        folder,
-        options,
-        "mesh.*",
-        "model.*",
-        how="Export the model (File > Export > Export Model) in the coordinate system of the "
-        "cameras into this folder",
-    )
-    return scan_of(
+    scan = scan_of(
         records,
-        mesh,
+        partial(_geometry, source, folder, records, options, findings),
         options,
         findings,
         adapter=NAME,
@@ -98,6 +97,121 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         folder=folder,
         up_axis=up_axis_assumed(records, options, findings, source.name),
     )
+    return with_doubts_about_unit(scan, options, stated=scan.usd_geometry is not None)
+
+
+# (3, 3) and (3,) from a chunk to a cube of -1 to 1, which holds its model; its sizes (3,) there.
+_Region = tuple[Double, Double, Double]
+
+
+def _geometry(
+    source: Path,
+    folder: Path,
+    records: Sequence[FrameRecord],
+    options: CaptureOptions,
+    findings: Findings,
+) -> ScanGeometry:
+    """The mesh in the frame of the cameras, also if it was exported in the chunk's."""
+    how = "Export the model (File > Export > Export Model) in the cameras' coordinates to here"
+    mesh = mesh_beside(folder, options, "mesh.*", "model.*", how=how)
+
+    def read(own: CaptureOptions) -> ScanGeometry:
+        return geometry_from_file(mesh, own.objects, own, findings, capture_root=folder)
+
+    chunk = _chunk(read_xml(source), source, Findings())
+    placed = chunk.find("components/component[transform]")
+    holder = chunk if placed is None else placed
+    own = _place(holder.find("transform"))
+    one = len(chunk.findall("components/component")) < 2 and mesh.suffix.lower() in MESH_SUFFIXES
+    found = _exported_in(mesh, own, _region(holder), records) if own and one else None
+    if own is None or found is None:
+        _refuse_geocentric(own, source)
+        return read(options)
+    place, (scale, said) = _near(own), found
+    findings.warn(
+        f"{mesh.name}: lies in {said}, not where its transform leads, by where the cameras see it; "
+        f"it is brought to the cameras, {place.scale / scale:.3g} times as large. [mesh.frame]"
+    )
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([place.rotation * (place.scale / scale), place.translation])
+    return moved_geometry(read, matrix, options, 1.0)
+
+
+def _exported_in(
+    mesh: Path, own: _Place, region: _Region | None, records: Sequence[FrameRecord]
+) -> tuple[float, str] | None:
+    """Where a mesh lies that is not in the world: how much larger the chunk's coordinates are
+    there, and its name. Cameras must see it there, clearly better than in the world, and it must
+    lie in the chunk's region; None where it is in the world, or nobody knows."""
+    place = _near(own)
+    # No mesh lies in geocentric coordinates, and hits alone are no proof against a refusal.
+    is_far = place is not own
+    if is_far and region is None:
+        return None
+    flat = [r for r in records if r.lens.curve != "equirectangular"]
+    frames = frames_from_records(flat, encoding="lin_rec709_scene", radiometric=True)
+    whole = mesh_from_file(mesh)
+    points = whole.points.astype(np.float64)
+    used = points[np.unique(whole.triangles)]
+    size = float(np.linalg.norm(np.ptp(used, axis=0)))
+
+    def hits(there: Double) -> float:
+        return hit_share(there.astype(np.float32), whole.triangles, frames) if flat else 0.0
+
+    inner = (used - place.translation) @ place.rotation / place.scale
+    here = 0.0 if is_far or not _lies_in(region, inner) else hits(points)
+    best = None
+    least = max(_SEEN, _CLEARLY_MORE * here)
+    known = {1.0: "the chunk's own coordinates", place.scale: "the chunk's own axes in its unit"}
+    for scale, said in known.items() if here < _SEEN_WHOLE else ():
+        filled = region is None or size / scale > _FILLED * float(np.linalg.norm(region[2]))
+        if filled and _lies_in(region, used / scale):
+            share = hits(points @ place.rotation.T * (place.scale / scale) + place.translation)
+            if share >= least:
+                best, least = (scale, said), share
+    return best
+
+
+def _region(chunk: Element) -> _Region | None:
+    """Where the chunk's model lies; None where the document does not say."""
+    holder = chunk.find("region")
+    if holder is None:
+        return None
+    centre, size = numbers_of(holder.find("center"), 3), numbers_of(holder.find("size"), 3)
+    turn = numbers_of(holder.find("R"), 9)
+    if centre is None or size is None or not (size > 0).all():
+        return None
+    axes = (np.eye(3) if turn is None else turn.reshape(3, 3)).T / (size[:, None] / 2)
+    return axes, -axes @ centre, size
+
+
+def _lies_in(region: _Region | None, points: Double) -> bool:
+    """Whether nearly all points (N, 3) of the chunk lie in its region, or there is none."""
+    if region is None:
+        return True
+    inner = points @ region[0].T + region[1]
+    return bool((np.abs(inner) <= _SLACK).all(axis=1).mean() >= _INSIDE)
+
+
+def _near(place: _Place) -> _Place:
+    """A place; of one that leads to geocentric coordinates what stands at the origin, z up."""
+    if _distance(place) <= _GEOCENTRIC:
+        return place
+    up = place.translation / _distance(place)
+    east = np.cross([0.0, 0, 1], up)
+    east = east / np.linalg.norm(east) if np.linalg.norm(east) > 0 else np.array([1.0, 0, 0])
+    axes = np.stack([east, np.cross(up, east), up])
+    return _Place(rotation=axes @ place.rotation, translation=np.zeros(3), scale=place.scale)
+
+
+def _refuse_geocentric(place: _Place | None, source: Path) -> None:
+    if place and (far := _distance(place)) > _GEOCENTRIC:
+        raise InputRefused(
+            f"{source}: the chunk is georeferenced: its transform leads {far / 1000:.0f} km away, "
+            "to geocentric coordinates, in which no model is exported, and the mesh does not lie "
+            "in the chunk's own. Make its coordinate system Local Coordinates (Reference > "
+            "Settings), update the transform, and export cameras and model again. [capture.pose]"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,14 +357,11 @@ def _places(chunk: Element, source: Path, findings: Findings) -> Callable[[Eleme
     own = _place(chunk.find("transform"))
     parts = chunk.iterfind("components/component")
     components = {part.get("id", ""): _place(part.find("transform")) for part in parts}
-    far = max((_distance(place) for place in (own, *components.values()) if place), default=0.0)
-    if far > _GEOCENTRIC:
-        raise InputRefused(
-            f"{source}: the chunk is georeferenced: its transform leads {far / 1000:.0f} km away, "
-            "to geocentric coordinates, in which no model is exported. Make its coordinate system "
-            "Local Coordinates (Reference > Settings), update the transform, and export cameras "
-            "and model again. [capture.pose]"
-        )
+    if len(components) > 1:
+        for place in components.values():
+            _refuse_geocentric(place, source)
+    components = {number: place and _near(place) for number, place in components.items()}
+    own = own and _near(own)
     if own is None and not any(components.values()):
         findings.warn(
             f"{source.name}: the chunk has no transform, so its unit is arbitrary. State "

@@ -13,7 +13,13 @@ from pathlib import Path, PurePosixPath
 
 from usdbrdf.capture.checks import Findings, FrameRecord, refuse_photographs
 from usdbrdf.capture.develop import with_rims
-from usdbrdf.capture.mesh_frames import LabelTable, folder_of_masks, path_in_capture
+from usdbrdf.capture.mesh_frames import (
+    LabelTable,
+    folder_of_masks,
+    folders_but_masks,
+    mask_beside,
+    path_in_capture,
+)
 from usdbrdf.capture.parts import (
     as_photographs,
     geometry_from_file,
@@ -24,7 +30,7 @@ from usdbrdf.errors import ImageRefused, InputRefused, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
 from usdbrdf.files.naming import composed, ends_of, meant_by, must_be_undistorted, number_at_end
-from usdbrdf.files.paths import AS_JPEG, contained, is_heif, seen_of
+from usdbrdf.files.paths import AS_JPEG, OtherLetters, contained, is_heif, seen_of, without_copies
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
@@ -41,9 +47,9 @@ _PHOTOGRAPHS, _RADIANCE = frozenset((".jpg", ".jpeg")) | _OF_CAMERAS, (".exr", "
 FOLDERS = ("frames", "images", "Images", "image", "Image", "photos", "undistorted", "")
 # Of documents that name pictures where they lay on another machine.
 _OTHER_FOLDER = "Name the folder of the pictures with --frames, or name them relative to this one"
+_LINKED = "Name the folder that the pictures themselves lie in with --frames"
 _THERE = "It is there: allow its folder with --allow-outside, or put the file inside this one"
 _LETTERS: tuple[Callable[[str], str], ...] = (str, str.lower)  # in which names are compared
-_MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,16 +85,17 @@ class Pictures:
         return path and _or_radiance(path, [p for p, _ in candidates], self.instead)
 
     def of_each_name(self) -> tuple[Path, ...]:
-        """One picture of each name: of a photograph with radiance beside it that. All of them where
-        two of one name are of one kind."""
+        """One picture of each name: of a photograph with radiance beside it that; without copies.
+        All of these where two of one name are of one kind."""
         alike: dict[Path, list[Path]] = {}
-        for path in self.paths:
+        originals = without_copies(self.paths)
+        for path in originals:
             alike.setdefault(path.with_suffix(""), []).append(path)
         chosen: list[Path] = []
         instead: dict[Path, Path] = {}
         for some in alike.values():
             if (best := nearest_to_radiance(some)) is None:
-                return self.paths
+                return originals
             chosen.append(best)
             if _is_radiance(best):
                 instead.update((p, best) for p in some if p.suffix.lower() in _PHOTOGRAPHS)
@@ -127,13 +134,9 @@ class Pictures:
         """The pictures by the number at the end of their names, those without left out; of two of
         one number the one that is nearer to radiance."""
         found: dict[int, list[Path]] = {}
-        for path in self.paths:
+        for path in without_copies(self.paths):
             found.setdefault(number_at_end(path.stem), []).insert(0, path)
         return {i: _nearest(alike)[0] for i, alike in sorted(found.items()) if i >= 0}
-
-
-def _nearness(path: Path) -> int:
-    return SUFFIXES.index(path.suffix.lower())
 
 
 def nearest_to_radiance(found: Sequence[Path]) -> Path | None:
@@ -150,8 +153,8 @@ def _nearest(found: Sequence[Path]) -> Sequence[Path]:
         return found
     kinds = {path: _kind_of_colours(path) for path in found}
     found = [path for path in found if kinds[path]] or found
-    best = min(map(_nearness, found))
-    found = [path for path in found if _nearness(path) == best]
+    nearness = {path: SUFFIXES.index(path.suffix.lower()) for path in found}
+    found = [path for path in found if nearness[path] == min(nearness.values())]
     return [path for path in found if kinds[path] == max(kinds[path] for path in found)]
 
 
@@ -190,8 +193,9 @@ def warn_of_radiance(instead: Mapping[Path, Path], findings: Findings, source: P
 
 
 def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
-    """The pictures of a capture: of ``--frames``, else of the first of the ``usual`` folders (or of
-    those that most programs use) that holds any."""
+    """The pictures of a capture: of ``--frames``, else of the first of the ``usual`` folders that
+    holds any, also if its name differs in case; without these of the first of those that most
+    programs use, else of the only folder that holds any but masks."""
     if options.frames is not None:
         if not options.frames.is_dir():
             raise UsageError(
@@ -199,11 +203,15 @@ def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
                 "[usage.option]"
             )
         return _below(options.frames.resolve(), deep=True)
+    called = OtherLetters(folder)
     for name in usual or FOLDERS:
-        place = path_in_capture(folder, name, options) if name else folder
+        place = path_in_capture(folder, name, options, cure=_LINKED) if name else folder
+        place = called.of(place)
         if place.is_dir() and (found := _below(place, deep=bool(name))).paths:
             return found
-    return Pictures(folder=folder, paths=())
+    others = (_below(p, deep=True) for p in folders_but_masks(folder)) if not usual else ()
+    holding = [found for found in others if found.paths]
+    return holding[0] if len(holding) == 1 else Pictures(folder=folder, paths=())
 
 
 def _below(folder: Path, *, deep: bool) -> Pictures:
@@ -231,6 +239,8 @@ class Pictured:
     instead: dict[Path, Path] = field(default_factory=dict)
     _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
     _refused: list[InputRefused] = field(default_factory=list)
+
+    _letters = cached_property(lambda self: OtherLetters(self.folder))
 
     def of(self, name: str, below: str = "") -> Path | None:
         """The picture called ``name`` in the folder ``below``: the file of this name, else the one
@@ -276,14 +286,23 @@ class Pictured:
         return nearest
 
     def file(self, name: str, *, fewest: int = 1) -> Path:
-        """Another file that the document names, which need not be there, with what leads out taken
-        alike, by an end of ``fewest`` parts or more."""
+        """Another file that the document names, which need not be there; else the only one whose
+        path differs in case alone; of what leads out that at an end of ``fewest`` parts or more."""
+
+        def look(path: Path) -> Path | None:
+            return found if (found := self._letters.of(path)).is_file() else None
+
+        path_of = name if os.path.lexists(self.folder / name) else name.replace("\\", "/")
         try:
-            return path_in_capture(self.folder, name, self.options)
+            path = path_in_capture(self.folder, path_of, self.options)
         except InputRefused:
-            if found := self._at_end_of(name, lambda p: p if p.is_file() else None, fewest):
+            if found := self._at_end_of(name, look, fewest):
                 return found
             raise
+        found = look(path) or path
+        if composed(found.name) != composed(path.name):
+            self.otherwise[name] = found
+        return found
 
     def _at_end_of(
         self, path: str, look: Callable[[Path], Path | None], fewest: int = 1
@@ -327,20 +346,10 @@ class Pictured:
     def _in_folder(self, folder: Path) -> dict[str, list[Path]]:
         if folder not in self._listed:
             of_stem = self._listed[folder] = {}
-            place = self._folder_called(folder)
+            place = self._letters.of(folder)
             for path in _below(place, deep=False).paths if place.is_dir() else ():
                 of_stem.setdefault(composed(path.stem).lower(), []).append(path)
         return self._listed[folder]
-
-    def _folder_called(self, folder: Path) -> Path:
-        """A folder of the capture, else the only one there whose name differs in case alone."""
-        if folder.is_dir() or not folder.is_relative_to(self.folder):
-            return folder
-        above, name = self._folder_called(folder.parent), composed(folder.name).lower()
-        there = above.iterdir() if above.is_dir() else ()
-        # No links: they may lead out.
-        alike = [p for p in there if composed(p.name).lower() == name and not p.is_symlink()]
-        return alike[0] if len(alike) == 1 and alike[0].is_dir() else folder
 
 
 def _kind_of_file(path: Path) -> str:
@@ -357,19 +366,6 @@ def _names_without_suffix(name: str) -> tuple[str, ...]:
     return (stem,) if kind in SUFFIXES else (name,)
 
 
-def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None:
-    """The mask of a picture in masks/, of its name there (in subfolders too), with its suffix or
-    not; black is what is not to be looked at."""
-    stem = str(PurePosixPath(name).with_suffix(""))
-    for usual in (name, stem, f"{stem}_mask", f"{name}.mask"):
-        for suffix in _MASK_SUFFIXES:
-            # Of which nothing can be asked, as of too long a name, is not there.
-            if os.path.isfile(folder / "masks" / f"{usual}{suffix}"):
-                return path_in_capture(folder, f"masks/{usual}{suffix}", options)
-    same = folder / "masks" / name
-    return path_in_capture(folder, f"masks/{name}", options) if os.path.isfile(same) else None
-
-
 def drop_without_picture(label: str, findings: Findings) -> None:
     """Leave out a camera whose picture was not found."""
     findings.drop(label, "no picture, or more than one, has this name", "capture.file")
@@ -378,8 +374,12 @@ def drop_without_picture(label: str, findings: Findings) -> None:
 def refuse_without_pictures(pictures: Pictures, source: Path) -> None:
     """InputRefused where no picture was found at all."""
     if not pictures.paths:
-        found = (p for p in seen_of(pictures.folder.rglob("*")) if p.suffix.lower() in _HEIF)
+        there = seen_of(pictures.folder.rglob("*"))
         how = ". Put them beside it in a folder images, or name their folder with --frames"
+        links = (p for p in there if p.is_symlink() and p.suffix.lower() in SUFFIXES)
+        if link := next(links, None):
+            how = f": {link.name} is a link that leads out of it, or nowhere. {_LINKED}"
+        found = (p for p in there if p.suffix.lower() in _HEIF)
         if heif := next(filter(is_heif, found), None):
             how = f" that are read: {heif.name} is {AS_JPEG}"
         raise InputRefused(f"{source}: no pictures below {pictures.folder}{how}. [capture.frames]")

@@ -13,7 +13,7 @@ order (nerf_loader.h, marching_cubes.cu).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy as np
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO, are_said_to_be_opencvs, opengl_from_opencv
 from usdbrdf.capture.formats.colmap import world_from_camera
-from usdbrdf.capture.mesh_frames import Lies, lies_with_points
+from usdbrdf.capture.mesh_frames import Lies, lies_with_points, moved_geometry
 from usdbrdf.capture.rigid_poses import LARGEST_OF_POSE, is_camera_matrix, rigid_pose
 from usdbrdf.errors import InputRefused, UsdBrdfError
 from usdbrdf.files.documents import read_json
@@ -186,12 +186,12 @@ def geometry_at_home(
             "[mesh.frame]"
         )
         home = np.linalg.inv(applied.similarity) @ _document_from_ngp(mesh, document)
-        return _moved(read, np.asarray(home, np.float64), options, meters_per_unit)
+        return moved_geometry(read, np.asarray(home, np.float64), options, meters_per_unit)
     statements = statements_beside(mesh)
     if mesh.suffix.lower() in MESH_SUFFIXES and (mesh.name in _COLMAPS or not statements):
         known = _home_of_colmaps(mesh, folder, findings, applied)
         if known is not None:
-            return _moved(read, known, options, meters_per_unit)
+            return moved_geometry(read, known, options, meters_per_unit)
     if statements and mesh.suffix.lower() in USD_SUFFIXES:
         raise InputRefused(
             f"{mesh}: {FILE} beside it says that it lies in the frame that nerfstudio trained in, "
@@ -221,25 +221,7 @@ def geometry_at_home(
         f"it is brought back, {scale:.3g} times as large. Remove that file if the mesh has been "
         "moved back already. [mesh.frame]"
     )
-    return _moved(read, matrix, options, meters_per_unit)
-
-
-def _moved(
-    read: Callable[[CaptureOptions], ScanGeometry],
-    matrix: Double,
-    options: CaptureOptions,
-    meters_per_unit: float,
-) -> ScanGeometry:
-    """What is read, by a similarity (4, 4)."""
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    unit = (options.meters_per_unit or meters_per_unit) * scale
-    found = read(replace(options, meters_per_unit=unit))
-    points = found.mesh.points @ matrix[:3, :3].T + matrix[:3, 3]
-    normals = found.mesh.corner_normals @ (matrix[:3, :3].T / scale)
-    moved = replace(
-        found.mesh, points=points.astype(np.float32), corner_normals=normals.astype(np.float32)
-    )
-    return replace(found, mesh=moved)
+    return moved_geometry(read, matrix, options, meters_per_unit)
 
 
 def _trained_from_capture(statement: Path, applied: Applied) -> Double:

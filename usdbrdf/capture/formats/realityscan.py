@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.camera_checks import with_doubts_about_unit
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.conventions import opengl_from_opencv
 from usdbrdf.capture.formats.named_pictures import (
@@ -129,7 +130,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         "model.*",
         how="Export the model in the coordinate system of the cameras into this folder",
     )
-    return scan_of(records, mesh, options, findings, adapter=NAME, source=source, folder=folder)
+    scan = scan_of(records, mesh, options, findings, adapter=NAME, source=source, folder=folder)
+    return with_doubts_about_unit(scan, options, stated=scan.usd_geometry is not None)
 
 
 def records_of_table(source: Path, pictures: Pictures, findings: Findings) -> Iterator[FrameRecord]:

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
-from usdbrdf.capture.camera_checks import warn_of_rolling_shutter
+from usdbrdf.capture.camera_checks import warn_of_rolling_shutter, with_doubts_about_unit
 from usdbrdf.capture.checks import Findings, FrameRecord, at_image_size, clause_of
 from usdbrdf.capture.conventions import OLD_NERFSTUDIO, warn_of_conventions
 from usdbrdf.capture.formats.named_pictures import Pictured, scan_of
@@ -107,7 +107,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
                 "along z as the format has it. Y is taken; say --up-axis Z if that is wrong. "
                 "[capture.up-axis]"
             )
-    return scan_of(
+    scan = scan_of(
         records,
         lambda: _geometry(capture, findings),
         options,
@@ -120,6 +120,8 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         meters_per_unit=capture.positive({}, "meters_per_unit") or 1.0,
         up_axis=up_axis,
     )
+    stated = "meters_per_unit" in capture.document or scan.usd_geometry is not None
+    return with_doubts_about_unit(scan, options, stated=stated)
 
 
 def _geometry(capture: _Capture, findings: Findings) -> ScanGeometry:

@@ -17,8 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from usdbrdf.capture.adapters import DESCRIPTIONS
+from usdbrdf.capture.camera_checks import with_doubts_about_unit
 from usdbrdf.capture.checks import Findings, FrameRecord, clause_of
 from usdbrdf.capture.formats.named_pictures import (
+    Pictured,
     Pictures,
     drop_without_picture,
     nearest_to_radiance,
@@ -28,7 +30,6 @@ from usdbrdf.capture.formats.named_pictures import (
     warn_of_radiance,
     warn_of_unused,
 )
-from usdbrdf.capture.mesh_frames import path_in_capture
 from usdbrdf.capture.parts import geometry_from_file, geometry_from_usd
 from usdbrdf.errors import ImageRefused, InputRefused
 from usdbrdf.files.images import image_size
@@ -101,7 +102,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
             )
         return geometry_from_usd(stage, options, findings, capture_root=folder, subsets=True)
 
-    return scan_of(
+    scan = scan_of(
         records,
         geometry,
         options,
@@ -113,6 +114,7 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         meters_per_unit=found.meters_per_unit,
         up_axis=found.up_axis,
     )
+    return with_doubts_about_unit(scan, options, stated=found.states_unit)
 
 
 def _records(
@@ -121,7 +123,9 @@ def _records(
     by_plate = options.frames is None and any(s.camera.images[s.i] for s in shots)
     if by_plate:
         shots = _with_places(shots, findings)
-        named = [(shot, _plate_file(shot, stage.parent, options)) for shot in shots]
+        plates = Pictured(folder=stage.parent, options=options)
+        named = [(shot, _plate_file(shot, plates)) for shot in shots]
+        plates.warn_of_others(findings, stage)
     else:
         pictures = pictures_of(stage.parent, options)
         refuse_without_pictures(pictures, stage)
@@ -236,7 +240,11 @@ def _found(
     the number of its time, among those in a folder of its first name, or whose names begin with
     that, if it is not alone."""
     by_identifier: dict[str, list[Path]] = {}
+    # Some exporters keep the suffix: A_jpg is A.jpg, also beside A.jpg.exr.
+    by_whole_name: dict[str, list[Path]] = {}
     for path in pictures.paths:
+        for identifier in _identifiers(path.name):
+            by_whole_name.setdefault(identifier, []).append(path)
         for identifier in _identifiers(path.stem):
             by_identifier.setdefault(identifier, []).append(path)
     alone = len({shot.camera.path for shot in shots}) == 1
@@ -245,6 +253,8 @@ def _found(
     def found(shot: _Shot, first: str, names: tuple[str, ...]) -> Path | None:
         if math.isnan(shot.time):
             exact = next(filter(None, map(pictures.named, names)), None)
+            if exact is None and len(whole := by_whole_name.get(first, [])) == 1:
+                exact = pictures.named(whole[0].relative_to(pictures.folder).as_posix())
             return exact or nearest_to_radiance(by_identifier.get(first, []))
         if first not in numbered:
             starts = re.compile(rf"{first}\D?\d+")
@@ -299,13 +309,14 @@ def _identifiers(stem: str) -> set[str]:
     return {identifier_from(stem), re.sub(r"\W|^\d", "_", stem, flags=re.ASCII)}
 
 
-def _plate_file(shot: _Shot, folder: Path, options: CaptureOptions) -> Path | None:
-    plate = shot.camera.images[shot.i]
+def _plate_file(shot: _Shot, plates: Pictured) -> Path | None:
+    """The picture that a camera names, existing or not; None where it names none."""
+    plate, folder = shot.camera.images[shot.i], plates.folder
     if not plate:
         return None
     inside = Path(plate).is_relative_to(folder)
     relative = Path(plate).relative_to(folder).as_posix() if inside else plate
-    return path_in_capture(folder, relative, options)
+    return plates.of(relative) or Path(plate)
 
 
 def _record(shot: _Shot, image: Path, findings: Findings) -> Iterator[FrameRecord]:
