@@ -100,6 +100,18 @@ def test_children_deal_out_the_objects_as_they_like(unwrapped, monkeypatch, face
     np.testing.assert_array_equal(again, resolution)
 
 
+def test_charts_are_the_same_whichever_corner_a_triangle_begins_with(unwrapped):
+    """As of faces that were wound backwards, and turned."""
+    scene, resolution = unwrapped
+    start = np.random.default_rng(3).integers(0, 3, len(scene.triangles))
+    order = (start[:, None] + np.arange(3)) % 3
+    other = replace(scene, triangles=np.take_along_axis(scene.triangles, order, axis=1))
+    uv, again = unwrap(other, TexelSizes.even(other, 0.02))
+    expected = np.take_along_axis(scene.corner_uv, order[..., None], axis=1)
+    np.testing.assert_array_equal(uv, expected)
+    np.testing.assert_array_equal(again, resolution)
+
+
 def test_no_two_triangles_share_a_texel_centre(unwrapped):
     scene, resolution = unwrapped
     pixel = scene.corner_uv * resolution[scene.face_object][:, None]

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -174,7 +175,8 @@ def charts_of_scene(
 
 def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
     """UVs of every object in its own atlas: corner_uv (F, 3, 2) in [0, 1], v up, and the atlas
-    size in texels of each object, (num_objects, 2) int32 width, height.
+    size in texels of each object, (num_objects, 2) int32 width, height. They do not depend on which
+    of its corners a triangle begins with.
 
     An object on which xatlas crashes or computes without end has its triangles packed one by one.
     Raises InputRefused when an atlas would be larger than 16,384 texels on a side, and LateChild
@@ -194,10 +196,16 @@ def unwrap(scene: Scene, sizes: TexelSizes) -> tuple[Float, Int]:
         side = math.ceil(math.sqrt(texels[obj.faces].sum()))
         if side > MAX_SIDE:
             raise too_large(obj, f"{area[obj.faces].sum():.3g} m^2 would need {side} x {side}")
+    # Charts grow from edges in the order in which triangles name them, which is chance where they
+    # were turned towards the cameras.
+    order = (scene.triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    scene = replace(scene, triangles=np.take_along_axis(scene.triangles, order, axis=1))
     try:
-        corner_uv, resolution = _side_by_side(scene, sizes)
+        found, resolution = _side_by_side(scene, sizes)
     except (CrashedChild, EnvironmentFailure):  # one alone takes less memory, too
-        corner_uv, resolution = _one_by_one(scene, sizes)
+        found, resolution = _one_by_one(scene, sizes)
+    corner_uv = np.empty_like(found)
+    np.put_along_axis(corner_uv, order[..., None], found, axis=1)
     for obj, (width, height) in zip(scene.objects, resolution, strict=True):
         if max(width, height) > MAX_SIDE:
             raise too_large(obj, f"texture would be {width} x {height}")
