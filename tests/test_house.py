@@ -426,7 +426,6 @@ ENGINEERING: dict[str, str] = {
     "_SEED_OF_DOUBT": "random numbers of their own",
     "_SEED_OF_THROUGH": "random numbers of their own",
     "_SEEN": "what is refused as not seen",
-    "_SEEN_WHOLE": "time",
     "_SEGMENTS": "time: how many are asked",
     "_SHARE": "memory",
     "_SHIFTED": "time: how many readings are tried",

@@ -23,12 +23,12 @@ from tests.capture.test_scan_from_rgbd_scans import (
 )
 from tests.format_truth import HEIGHT, WIDTH, assert_same, truth, write_image
 from tests.scenes import write_ply
+from usdbrdf.capture import mesh_frames
 from usdbrdf.capture.adapters import choose_adapter, read_scan
 from usdbrdf.capture.checks import Findings
 from usdbrdf.capture.formats.named_pictures import Pictures
 from usdbrdf.capture.reconstructions import rgbd_scans
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.paths import without_copies
 
 
 @pytest.mark.parametrize(
@@ -228,6 +228,20 @@ def test_copies_of_pictures_are_no_frames(tmp_path, copy, every):
         ["1_2", "1", "2"],
     ],
 )
-def test_what_is_called_alike_need_not_be_a_copy(names):
+def test_what_is_called_alike_need_not_be_a_copy(names, monkeypatch):
+    monkeypatch.setattr(mesh_frames, "_is_made_of", lambda *_: True)
     paths = tuple(Path(f"/scan/rgb/{name}.jpg") for name in names)
-    assert without_copies(paths) == paths
+    assert mesh_frames.without_copies(paths) == paths
+
+
+@pytest.mark.parametrize("name", ["{0}_flash", "hall_{0}", "top/{0}", "{0} (1)"])
+def test_another_picture_of_that_size_is_no_copy(tmp_path, name):
+    """Of twice as many poses, or of none."""
+    first, second = truth().images[:2]
+    write_image(tmp_path / "1.png", first)
+    paths = [tmp_path / "1.png", tmp_path / f"{name.format(1)}.png"]
+    paths[1].parent.mkdir(exist_ok=True)
+    write_image(paths[1], second)
+    assert mesh_frames.without_copies(paths) == tuple(paths)
+    write_image(paths[1], first)
+    assert mesh_frames.without_copies(paths) == (paths[0],)

@@ -508,8 +508,9 @@ def test_a_folder_of_two_exports_is_one_of_metashape(project):
     assert choose_adapter(project).name == "metashape"
 
 
-def _write_region(project, room):
-    """As Metashape writes it: centre, size and axes of a box in the chunk's coordinates."""
+def _write_region(project, room, times=1.1):
+    """As Metashape writes it: centre, size and axes of a box in the chunk's coordinates, so many
+    times as large as the room."""
     document = ET.parse(project / "cameras.xml")
     points = (room.points - SHIFT) @ TURN / SCALE
     axes = Rotation.from_euler("z", 30, degrees=True).as_matrix()
@@ -517,19 +518,15 @@ def _write_region(project, room):
     low, high = inner.min(axis=0), inner.max(axis=0)
     region = _child(document.getroot().find("chunk"), "region")
     _child(region, "center", _text(axes @ (low + high) / 2))
-    _child(region, "size", _text((high - low) * 1.1))
+    _child(region, "size", _text((high - low) * times))
     _child(region, "R", _text(axes))
     document.write(project / "cameras.xml")
 
 
-@pytest.mark.parametrize("region", [True, False])
 @pytest.mark.parametrize("unit", [1.0, SCALE])
-def test_a_model_in_the_chunks_own_coordinates_is_brought_to_the_cameras(
-    project, room, region, unit
-):
+def test_a_model_in_the_chunks_own_coordinates_is_brought_to_the_cameras(project, room, unit):
     """Rays were said to miss it, or to hit one in another unit; or it was taken as it lay."""
-    if region:
-        _write_region(project, room)
+    _write_region(project, room)
     write_obj(project / "model.obj", room, (room.points - SHIFT) @ TURN / SCALE * unit)
     scan = read_scan(project, OPTIONS)
     assert_same(scan, room, names=room.names)
@@ -542,6 +539,18 @@ def test_a_model_where_the_transform_leads_stays_there(project, room):
     scan = read_scan(project, OPTIONS)
     assert_same(scan, room, names=room.names)
     assert not any("[mesh.frame]" in said for said in scan.warnings)
+
+
+@pytest.mark.parametrize(("size", "times"), [(0.3, 0.33), (0.3, 1.2), (0.1, 0.4), (1.0, 4.0)])
+def test_a_thing_before_the_cameras_stays_as_large_as_it_is(project, room, size, times):
+    """A larger one would be hit by more of their rays."""
+    middle = room.points.mean(axis=0)
+    points = middle + size * (room.points - middle)
+    _write_region(project, room, times)
+    write_obj(project / "model.obj", room, points)
+    scan = read_scan(project, OPTIONS)
+    assert not any("[mesh.frame]" in said for said in scan.warnings)
+    np.testing.assert_allclose(np.ptp(scan.mesh.points, axis=0), np.ptp(points, axis=0), rtol=1e-5)
 
 
 def test_a_georeferenced_chunk_has_its_model_in_its_own_coordinates(project, room):

@@ -37,7 +37,7 @@ _MAX_BEHIND = 0.5  # of a frame's rays that hit the backs of faces
 _EXIF_STOPS, _EXIF_TIMES = 1 / 3, 1.3
 # Metres from cameras to what they see, in rooms and before things; and those beyond which they are
 # neither, without a doubt. Units in which coordinates are written, the likelier first.
-_ROOM, _NEAREST, _FARTHEST = (0.3, 12.0), 0.03, 60.0
+_ROOM, _NEAREST, _FARTHEST = (0.3, 12.0), 0.03, 150.0
 _LIKELY_UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
 # Frames that are probed with rays, and rays along each side of them.
 _PROBED_FRAMES, _PROBED_SIDE = 64, 8

@@ -1,11 +1,13 @@
-"""Where the files are that a capture's documents name. Which mesh is a capture's, and in which
-frame it lies: where the points lie on it that its photographs share, and in which scene of several
-cameras a document stands whose own mesh is that of the scene."""
+"""Where the files are that a capture's documents name, and which pictures are copies. Which mesh is
+a capture's, and in which frame it lies: where the points lie on it that its photographs share, and
+in which scene of several cameras a document stands whose own mesh is that of the scene."""
 
 from __future__ import annotations
 
+import filecmp
 import os
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -14,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from usdbrdf.errors import InputRefused, MeshMissing, first_of
+from usdbrdf.errors import ImageRefused, InputRefused, MeshMissing, first_of
+from usdbrdf.files.images import image_size
 from usdbrdf.files.paths import contained, seen_of
 from usdbrdf.files.tables import beginning_of
 from usdbrdf.model.arrays import Double, Float, Int, Long
@@ -40,6 +43,14 @@ _MESHES = (*MESH_SUFFIXES, *sorted(USD_SUFFIXES))
 _MASK_SUFFIXES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
 _CALLED_MASKS = ("mask", "masks")
 _UNREAD_MESHES = frozenset((".gltf", ".stl", ".fbx", ".dae", ".3mf", ".off", ".wrl", ".x3d"))
+# What tells a copy's name from that of what it was made of; but not where it says what is shown.
+_COPIED = re.compile(r"[ ._-]*\((?:\d+|copy)\)|[ ._-]+(?:copy|kopie)\b.*", re.I)
+_OF_ONES_OWN = re.compile(r"rgb|colou?r|im(?:a)?ge?|frame|cam|left|right", re.I)
+# Folders of pictures that are no photographs, or not those that were taken.
+_OF_OTHERS = re.compile(
+    r"depth|normal|conf|label|segm|semantic|thumb|preview|texture|albedo|result|output|old|bak|copy",
+    re.I,
+)
 
 
 def path_in_capture(root: Path, candidate: str, options: CaptureOptions, *, cure: str = "") -> Path:
@@ -98,10 +109,55 @@ def mask_beside(folder: Path, name: str, options: CaptureOptions) -> Path | None
     return path_in_capture(folder, f"masks/{name}", options) if os.path.isfile(same) else None
 
 
+def without_copies(paths: Sequence[Path]) -> tuple[Path, ...]:
+    """Those of ``paths`` that are not called as others of them and more, being of another size or
+    the same to the byte: ``1 (1).jpg`` and ``1_small.jpg`` beside ``1.jpg``, and ``thumbs/1.jpg``
+    below it.
+
+    What more than there are others are called alike by are no copies, as the pictures that a
+    browser called ``image (1).jpg``, ``image (2).jpg`` and so on.
+    """
+    there, of_sign = set(paths), dict[str, set[Path]]()
+    for path in paths:
+        for original, sign in _originals(path):
+            if original in there and _is_made_of(path, original):
+                of_sign.setdefault(re.sub(r"\d+", "#", sign), set()).add(path)
+    copies: set[Path] = set().union(*of_sign.values())
+    originals = len(paths) - len(copies)
+    copies = set().union(*(some for some in of_sign.values() if len(some) <= originals))
+    return tuple(path for path in paths if path not in copies)
+
+
+def _originals(path: Path) -> Iterator[tuple[Path, str]]:
+    """Of what a picture may be a copy, by its name, and by which sign of it."""
+    stem = path.stem
+    for found in re.finditer(r"[ ._(-]+", stem):
+        before, behind = stem[: found.start()], stem[found.start() :]
+        ahead, after = stem[: found.end()], stem[found.end() :]
+        for base, sign in ((before, behind), (after, ahead)):
+            says = re.search("[^\\W\\d_]", sign) and not _OF_ONES_OWN.search(sign)
+            if base and (says or (sign is behind and _COPIED.fullmatch(sign))):
+                yield path.with_name(base + path.suffix), sign
+    above = path.parent
+    while above != above.parent and not _OF_ONES_OWN.search(above.name):
+        above = above.parent
+        yield above / path.name, path.parent.name + "/"
+
+
+def _is_made_of(path: Path, original: Path) -> bool:
+    with suppress(OSError, ImageRefused):
+        if image_size(path)[:2] != image_size(original)[:2]:
+            return True
+        return filecmp.cmp(path, original, shallow=False)
+    return False
+
+
 def folders_but_masks(folder: Path) -> list[Path]:
-    """The folders in a folder that are no links and not called as those of masks are."""
+    """The folders in a folder that are no links and not called as those of masks are, or of other
+    pictures than photographs."""
     there = (p for p in seen_of(folder.iterdir()) if p.is_dir() and not p.is_symlink())
-    return [p for p in there if p.name.lower().strip("_") not in _CALLED_MASKS]
+    plain = (p for p in there if p.name.lower().strip("_") not in _CALLED_MASKS)
+    return [p for p in plain if not _OF_OTHERS.search(p.name)]
 
 
 def labels_of_others(mesh: Path) -> str:

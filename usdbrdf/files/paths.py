@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -193,7 +193,8 @@ class OtherLetters:
     def of(self, path: Path) -> Path:
         """The path itself where something is there or it does not lie below the root; else the only
         one whose names differ in nothing but case and how accents are written; else the path."""
-        if path == self.root or not path.is_relative_to(self.root) or os.path.lexists(path):
+        is_below = path != self.root and path.is_relative_to(self.root) and ".." not in path.parts
+        if not is_below or os.path.lexists(path):
             return path
         alike = self._in(self.of(path.parent)).get(composed(path.name).lower(), [])
         return alike[0] if len(alike) == 1 else path
@@ -201,9 +202,10 @@ class OtherLetters:
     def _in(self, folder: Path) -> dict[str, list[Path]]:
         if folder not in self._there:
             of_name = self._there[folder] = {}
-            for path in folder.iterdir() if folder.is_dir() else ():
-                if not path.is_symlink():  # it may lead out
-                    of_name.setdefault(composed(path.name).lower(), []).append(path)
+            with suppress(OSError):  # of what nobody may look into, or cannot be, nothing is known
+                for path in folder.iterdir() if folder.is_dir() else ():
+                    if not path.is_symlink():  # it may lead out
+                        of_name.setdefault(composed(path.name).lower(), []).append(path)
         return self._there[folder]
 
 
@@ -217,47 +219,3 @@ def seen_of(found: Iterable[Path], *, below: Path | None = None) -> list[Path]:
         return not any(name[0] == "." for name in names) and not any(map(path.match, _LITTER))
 
     return sorted(filter(seen, found))
-
-
-# What tells a copy's name from that of what it was made of; but not where it says what is shown.
-_COPIED = re.compile(r"[ ._-]*\((?:\d+|copy)\)|[ ._-]+(?:copy|kopie)\b.*", re.I)
-_PICTURES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr", ".hdr"))
-_OF_ONES_OWN = re.compile(r"rgb|colou?r|im(?:a)?ge?|frame|cam|left|right", re.I)
-
-
-def without_copies(paths: Sequence[Path]) -> tuple[Path, ...]:
-    """Those of ``paths`` that are not called as others of them and more: ``1 (1).jpg``,
-    ``1_small.jpg`` and ``1.jpg.exr`` beside ``1.jpg``, and ``thumbs/1.jpg`` below it.
-
-    What more than there are others are called alike by are no copies, as the pictures that a
-    browser called ``image (1).jpg``, ``image (2).jpg`` and so on.
-    """
-    there = {path.with_suffix("") for path in paths}
-    kinds = {(path.with_suffix(""), path.suffix.lower()) for path in paths}
-    of_sign: dict[str, set[Path]] = {}
-    for path in paths:
-        for base, sign, any_kind in _bases(path):
-            if (base in there) if any_kind else ((base, path.suffix.lower()) in kinds):
-                of_sign.setdefault(re.sub(r"\d+", "#", sign), set()).add(path)
-    copies: set[Path] = set().union(*of_sign.values())
-    originals = len(paths) - len(copies)
-    copies = set().union(*(some for some in of_sign.values() if len(some) <= originals))
-    return tuple(path for path in paths if path not in copies)
-
-
-def _bases(path: Path) -> Iterator[tuple[Path, str, bool]]:
-    """Of what a picture may be a copy, without suffix, by which sign, and whether what is another
-    kind of file may be too."""
-    stem = path.stem
-    for found in re.finditer(r"[ ._(-]+", stem):
-        before, behind = stem[: found.start()], stem[found.start() :]
-        ahead, after = stem[: found.end()], stem[found.end() :]
-        plain = _COPIED.fullmatch(behind) is not None or behind.lower() in _PICTURES
-        for base, sign in ((before, behind), (after, ahead)):
-            letters = re.search("[^\\W\\d_]", sign) and not _OF_ONES_OWN.search(sign)
-            if base and (letters or (plain and sign is behind)):
-                yield path.with_name(base), sign, plain and sign is behind
-    above = path.parent
-    while above != above.parent and not _OF_ONES_OWN.search(above.name):
-        above = above.parent
-        yield above / stem, path.parent.name + "/", False

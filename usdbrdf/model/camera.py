@@ -80,8 +80,8 @@ def is_of_turned(
     intrinsics: tuple[float, float, float, float], width: float, height: float
 ) -> bool:
     """Whether fx, fy, cx, cy are those of a picture of these sides that was turned by a quarter:
-    the axis lies nearer to the middle of that one."""
+    the axis lies clearly nearer to the middle of that one."""
     _, _, x, y = intrinsics
     here = max(abs(x / width - 0.5), abs(y / height - 0.5))
     there = max(abs(x / height - 0.5), abs(y / width - 0.5))
-    return bool(there < here)
+    return bool(2 * there < here)

@@ -61,8 +61,8 @@ _CURVES: dict[str, Curve] = {
 }
 # From the Earth's middle, in metres: nothing stands so far from the origin of its own coordinates.
 _GEOCENTRIC = 1e6
-# Of rays that hit a mesh where it is seen, as much as nowhere else, and times as many as elsewhere.
-_SEEN, _SEEN_WHOLE, _CLEARLY_MORE = 0.2, 0.9, 1.5
+# Of rays that hit a mesh where it is seen.
+_SEEN = 0.2
 # Of a mesh's vertices that lie in the region of its chunk, made larger; and of its size.
 _INSIDE, _SLACK, _FILLED = 0.9, 1.05, 0.2
 
@@ -97,7 +97,10 @@ def read(path: Path, options: CaptureOptions) -> Scan:
         folder=folder,
         up_axis=up_axis_assumed(records, options, findings, source.name),
     )
-    return with_doubts_about_unit(scan, options, stated=scan.usd_geometry is not None)
+    # Geocentric coordinates are in metres.
+    place = _place(_chunk(read_xml(source), source, Findings()).find("transform"))
+    stated = scan.usd_geometry is not None or (place is not None and _near(place) is not place)
+    return with_doubts_about_unit(scan, options, stated=stated)
 
 
 # (3, 3) and (3,) from a chunk to a cube of -1 to 1, which holds its model; its sizes (3,) there.
@@ -121,9 +124,9 @@ def _geometry(
     chunk = _chunk(read_xml(source), source, Findings())
     placed = chunk.find("components/component[transform]")
     holder = chunk if placed is None else placed
-    own = _place(holder.find("transform"))
+    own, region = _place(holder.find("transform")), _region(holder)
     one = len(chunk.findall("components/component")) < 2 and mesh.suffix.lower() in MESH_SUFFIXES
-    found = _exported_in(mesh, own, _region(holder), records) if own and one else None
+    found = _exported_in(mesh, own, region, records) if own and region and one else None
     if own is None or found is None:
         _refuse_geocentric(own, source)
         return read(options)
@@ -138,16 +141,12 @@ def _geometry(
 
 
 def _exported_in(
-    mesh: Path, own: _Place, region: _Region | None, records: Sequence[FrameRecord]
+    mesh: Path, own: _Place, region: _Region, records: Sequence[FrameRecord]
 ) -> tuple[float, str] | None:
     """Where a mesh lies that is not in the world: how much larger the chunk's coordinates are
-    there, and its name. Cameras must see it there, clearly better than in the world, and it must
-    lie in the chunk's region; None where it is in the world, or nobody knows."""
+    there, and its name. Cameras must see it there, and it must lie in the chunk's region and
+    fill it; None where it does so in the world, or nobody knows."""
     place = _near(own)
-    # No mesh lies in geocentric coordinates, and hits alone are no proof against a refusal.
-    is_far = place is not own
-    if is_far and region is None:
-        return None
     flat = [r for r in records if r.lens.curve != "equirectangular"]
     frames = frames_from_records(flat, encoding="lin_rec709_scene", radiometric=True)
     whole = mesh_from_file(mesh)
@@ -158,14 +157,17 @@ def _exported_in(
     def hits(there: Double) -> float:
         return hit_share(there.astype(np.float32), whole.triangles, frames) if flat else 0.0
 
+    def fits(inner: Double, length: float) -> bool:
+        return length > _FILLED * float(np.linalg.norm(region[2])) and _lies_in(region, inner)
+
+    # What is larger is hit by more rays: a thing that any ray hits in the world stays there.
     inner = (used - place.translation) @ place.rotation / place.scale
-    here = 0.0 if is_far or not _lies_in(region, inner) else hits(points)
-    best = None
-    least = max(_SEEN, _CLEARLY_MORE * here)
+    if place is own and fits(inner, size / place.scale) and hits(points) > 0:
+        return None
+    best, least = None, _SEEN
     known = {1.0: "the chunk's own coordinates", place.scale: "the chunk's own axes in its unit"}
-    for scale, said in known.items() if here < _SEEN_WHOLE else ():
-        filled = region is None or size / scale > _FILLED * float(np.linalg.norm(region[2]))
-        if filled and _lies_in(region, used / scale):
+    for scale, said in known.items():
+        if fits(used / scale, size / scale):
             share = hits(points @ place.rotation.T * (place.scale / scale) + place.translation)
             if share >= least:
                 best, least = (scale, said), share
@@ -185,10 +187,8 @@ def _region(chunk: Element) -> _Region | None:
     return axes, -axes @ centre, size
 
 
-def _lies_in(region: _Region | None, points: Double) -> bool:
-    """Whether nearly all points (N, 3) of the chunk lie in its region, or there is none."""
-    if region is None:
-        return True
+def _lies_in(region: _Region, points: Double) -> bool:
+    """Whether nearly all points (N, 3) of the chunk lie in its region."""
     inner = points @ region[0].T + region[1]
     return bool((np.abs(inner) <= _SLACK).all(axis=1).mean() >= _INSIDE)
 

@@ -19,6 +19,7 @@ from usdbrdf.capture.mesh_frames import (
     folders_but_masks,
     mask_beside,
     path_in_capture,
+    without_copies,
 )
 from usdbrdf.capture.parts import (
     as_photographs,
@@ -30,7 +31,7 @@ from usdbrdf.errors import ImageRefused, InputRefused, UsageError
 from usdbrdf.files.colour import kind_of_encoding
 from usdbrdf.files.images import RAW_SUFFIXES, kind_of_colours
 from usdbrdf.files.naming import composed, ends_of, meant_by, must_be_undistorted, number_at_end
-from usdbrdf.files.paths import AS_JPEG, OtherLetters, contained, is_heif, seen_of, without_copies
+from usdbrdf.files.paths import AS_JPEG, OtherLetters, contained, is_heif, seen_of
 from usdbrdf.model.capture import Scan
 from usdbrdf.model.mesh import ScanGeometry
 from usdbrdf.options import CaptureOptions
@@ -85,17 +86,15 @@ class Pictures:
         return path and _or_radiance(path, [p for p, _ in candidates], self.instead)
 
     def of_each_name(self) -> tuple[Path, ...]:
-        """One picture of each name: of a photograph with radiance beside it that; without copies.
-        All of these where two of one name are of one kind."""
+        """One picture of each name: of a photograph with radiance beside it that. All of them where
+        two of one name are of one kind."""
         alike: dict[Path, list[Path]] = {}
-        originals = without_copies(self.paths)
-        for path in originals:
+        for path in self.paths:
             alike.setdefault(path.with_suffix(""), []).append(path)
-        chosen: list[Path] = []
-        instead: dict[Path, Path] = {}
+        chosen, instead = list[Path](), dict[Path, Path]()
         for some in alike.values():
             if (best := nearest_to_radiance(some)) is None:
-                return originals
+                return self.paths
             chosen.append(best)
             if _is_radiance(best):
                 instead.update((p, best) for p in some if p.suffix.lower() in _PHOTOGRAPHS)
@@ -130,11 +129,16 @@ class Pictures:
             for stem, alike in self._by_stem.items()
         }
 
+    @cached_property
+    def originals(self) -> Pictures:
+        """Without copies."""
+        return replace(self, paths=without_copies(self.paths))
+
     def numbered(self) -> dict[int, Path]:
         """The pictures by the number at the end of their names, those without left out; of two of
-        one number the one that is nearer to radiance."""
+        one number the one that is no copy, or is nearer to radiance."""
         found: dict[int, list[Path]] = {}
-        for path in without_copies(self.paths):
+        for path in self.originals.paths:
             found.setdefault(number_at_end(path.stem), []).insert(0, path)
         return {i: _nearest(alike)[0] for i, alike in sorted(found.items()) if i >= 0}
 
@@ -198,10 +202,7 @@ def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
     programs use, else of the only folder that holds any but masks."""
     if options.frames is not None:
         if not options.frames.is_dir():
-            raise UsageError(
-                f"--frames {options.frames}: no such folder. Name the one that holds the pictures. "
-                "[usage.option]"
-            )
+            raise UsageError(f"--frames {options.frames}: no such folder. Name one. [usage.option]")
         return _below(options.frames.resolve(), deep=True)
     called = OtherLetters(folder)
     for name in usual or FOLDERS:
@@ -209,8 +210,8 @@ def pictures_of(folder: Path, options: CaptureOptions, *usual: str) -> Pictures:
         place = called.of(place)
         if place.is_dir() and (found := _below(place, deep=bool(name))).paths:
             return found
-    others = (_below(p, deep=True) for p in folders_but_masks(folder)) if not usual else ()
-    holding = [found for found in others if found.paths]
+    others = () if usual else folders_but_masks(folder)
+    holding = [found for found in (_below(p, deep=True) for p in others) if found.paths]
     return holding[0] if len(holding) == 1 else Pictures(folder=folder, paths=())
 
 

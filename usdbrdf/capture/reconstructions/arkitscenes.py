@@ -26,7 +26,7 @@ from usdbrdf.capture.reconstructions.shots import (
     scan_of_shots,
 )
 from usdbrdf.errors import InputRefused
-from usdbrdf.files.paths import seen_of, without_copies
+from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import files_of, number_in, number_rows, only_one
 from usdbrdf.model.arrays import Bool, Double
 from usdbrdf.model.capture import Scan
@@ -113,7 +113,7 @@ def shots_of(source: Path, options: CaptureOptions, findings: Findings) -> list[
     folder = _home(source)
     places = _places(source, folder)
     cameras = _by_time(seen_of((folder / f"{places[0]}_intrinsics").glob("*.pincam")))
-    originals = without_copies(pictures_of(folder, options, *places).paths)
+    originals = pictures_of(folder, options, *places).originals.paths
     pictures = sorted(_by_time(originals).items())
     known, poses = _poses_at(np.array([time for time, _ in pictures]), np.stack(rows))
     found = []

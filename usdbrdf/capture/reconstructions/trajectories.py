@@ -65,7 +65,14 @@ def counted_pictures(
     """The pictures of poses that have these numbers, in their order, each with the place of its own
     pose, one behind the last where it has none. As many pictures as poses, or as their numbers
     count, are theirs one by one; fewer are those of the numbers at the end of their names.
-    InputRefused where nobody knows whose they are."""
+    Copies are told, and left out. InputRefused where nobody knows whose they are."""
+    given, pictures = pictures, pictures.originals
+    if passed := [path for path in given.paths if path not in set(pictures.paths)]:
+        findings.warn(
+            f"{source.name}: {len(passed)} of {len(given.paths)} pictures are left out as copies "
+            f"of others, such as {passed[0].relative_to(given.folder)}. Take them away, or call "
+            "them otherwise if they are none. [capture.frames]"
+        )
     each, count = pictures.of_each_name(), max(numbers, default=-1) + 1
     if len(each) in (0, len(numbers), count):
         in_order = sorted(each, key=lambda path: _natural(path.relative_to(pictures.folder)))
