@@ -245,3 +245,12 @@ def test_another_picture_of_that_size_is_no_copy(tmp_path, name):
     assert mesh_frames.without_copies(paths) == tuple(paths)
     write_image(paths[1], first)
     assert mesh_frames.without_copies(paths) == (paths[0],)
+
+
+@pytest.mark.parametrize(
+    ("name", "photographs"),
+    [("IMG", True), ("conference", True), ("gold", True), ("depthMaps", False), ("x.bak", False)],
+)
+def test_a_folder_of_other_pictures_is_none_of_photographs(tmp_path, name, photographs):
+    (tmp_path / name).mkdir()
+    assert bool(mesh_frames.folders_but_masks(tmp_path)) == photographs

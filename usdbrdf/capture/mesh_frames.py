@@ -48,7 +48,8 @@ _COPIED = re.compile(r"[ ._-]*\((?:\d+|copy)\)|[ ._-]+(?:copy|kopie)\b.*", re.I)
 _OF_ONES_OWN = re.compile(r"rgb|colou?r|im(?:a)?ge?|frame|cam|left|right", re.I)
 # Folders of pictures that are no photographs, or not those that were taken.
 _OF_OTHERS = re.compile(
-    r"depth|normal|conf|label|segm|semantic|thumb|preview|texture|albedo|result|output|old|bak|copy",
+    r"(?<![^\W_])(?:depth|normal|label|segm|semantic|thumb|preview|texture|albedo|result|output"
+    r"|(?:conf|confidence|old|bak|copy)(?![^\W_]))",
     re.I,
 )
 

@@ -25,6 +25,7 @@ from usdbrdf.capture.reconstructions.shots import (
     files_of_capture,
     scan_of_shots,
 )
+from usdbrdf.capture.reconstructions.trajectories import originals_of
 from usdbrdf.errors import InputRefused
 from usdbrdf.files.paths import seen_of
 from usdbrdf.files.tables import files_of, number_in, number_rows, only_one
@@ -113,8 +114,8 @@ def shots_of(source: Path, options: CaptureOptions, findings: Findings) -> list[
     folder = _home(source)
     places = _places(source, folder)
     cameras = _by_time(seen_of((folder / f"{places[0]}_intrinsics").glob("*.pincam")))
-    originals = pictures_of(folder, options, *places).originals.paths
-    pictures = sorted(_by_time(originals).items())
+    found_there = originals_of(pictures_of(folder, options, *places), source, findings)
+    pictures = sorted(_by_time(found_there.paths).items())
     known, poses = _poses_at(np.array([time for time, _ in pictures]), np.stack(rows))
     found = []
     for (time, picture), pose in zip(pictures, poses, strict=True):

@@ -59,6 +59,18 @@ def _is_turn(quaternion: Double) -> bool:
     return bool(np.abs(quaternion).max() < 2 and abs(np.linalg.norm(quaternion) - 1) < _OFF_LENGTH)
 
 
+def originals_of(pictures: Pictures, source: Path, findings: Findings) -> Pictures:
+    """The pictures that are no copies of others, with a sentence on those that are."""
+    kept = set(pictures.originals.paths)
+    if passed := [path for path in pictures.paths if path not in kept]:
+        findings.warn(
+            f"{source.name}: {len(passed)} of {len(pictures.paths)} pictures are left out as "
+            f"copies of others, such as {passed[0].relative_to(pictures.folder)}. Take them away, "
+            "or call them otherwise if they are none. [capture.frames]"
+        )
+    return pictures.originals
+
+
 def counted_pictures(
     pictures: Pictures, numbers: Sequence[int], source: Path, findings: Findings
 ) -> list[tuple[int, Path]]:
@@ -66,13 +78,7 @@ def counted_pictures(
     pose, one behind the last where it has none. As many pictures as poses, or as their numbers
     count, are theirs one by one; fewer are those of the numbers at the end of their names.
     Copies are told, and left out. InputRefused where nobody knows whose they are."""
-    given, pictures = pictures, pictures.originals
-    if passed := [path for path in given.paths if path not in set(pictures.paths)]:
-        findings.warn(
-            f"{source.name}: {len(passed)} of {len(given.paths)} pictures are left out as copies "
-            f"of others, such as {passed[0].relative_to(given.folder)}. Take them away, or call "
-            "them otherwise if they are none. [capture.frames]"
-        )
+    pictures = originals_of(pictures, source, findings)
     each, count = pictures.of_each_name(), max(numbers, default=-1) + 1
     if len(each) in (0, len(numbers), count):
         in_order = sorted(each, key=lambda path: _natural(path.relative_to(pictures.folder)))
