@@ -17,7 +17,7 @@ from usdbrdf.asset.readers.compose import open_measured
 
 # Lengths are in metres, whatever the capture is in.
 OPTIONS = usdbrdf.ConvertOptions(
-    texture=usdbrdf.TextureOptions(texel_size=0.2),
+    texture=usdbrdf.TextureOptions(texel_size=0.1),
     shade=usdbrdf.ShadeOptions(sampling=usdbrdf.Sampling(standard_error=0.05, max_rays=256)),
     fit=usdbrdf.FitOptions(max_pixels=60),
 )
