@@ -265,6 +265,7 @@ ENGINEERING: dict[str, str] = {
     "_FRAMES": "time",
     "_FRAMES_OF_GLOSS": "time",
     "_FRAMES_OF_NOISE": "time",
+    "_FROM_AFAR": "discretisation of the filling in",
     "_FULL_FRAME_MM": "convention of a format",
     "_GAP": "keeps lights off surfaces",
     "_GEOCENTRIC": "limit of what is refused",

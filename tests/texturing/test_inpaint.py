@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -135,3 +136,17 @@ def test_far_from_what_was_seen_no_single_texel_decides():
     far = ~known & (position[:, 0] > 0.6)
     assert np.median(filled[far]) == pytest.approx(0.1 * 100**0.24, rel=0.3)
     assert filled[~known & (column == 21)].min() > 0.5
+
+
+def test_from_afar_a_few_texels_that_mix_with_what_is_behind_them_tell_little():
+    """A square seen in its left third, of whose texels a sixth, anywhere, are a hundred times as
+    bright as the others."""
+    one = world_of([quad((0, 0, 0), (1, 0, 0), (0, 1, 0), size=(64, 64))])
+    across = one.texels.position[:, 0]
+    known = across < 1 / 3
+    bright = np.random.default_rng(2).random(len(known)) < 1 / 6
+    values = np.where(bright, 1.0, 0.01)[:, None].astype(np.float32) * np.ones(3, np.float32)
+    filled = inpaint(one.texels, np.where(known[:, None], values, np.nan), known)
+    far = np.log(filled[across > 0.6, 0])
+    assert far.mean() == pytest.approx(math.log(0.01 * 100 ** (1 / 6)), abs=0.3)
+    assert far.std() < 0.4

@@ -5,7 +5,8 @@ not beside them."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,9 @@ from usdbrdf import calibration
 from usdbrdf.model.arrays import Bool, Double, Float, Long
 from usdbrdf.model.texels import Texels
 
-_NEIGHBOURS = 8
+# Texels that a fill is the mean of, and one from afar: there few that mix with what is behind them,
+# as the edges of blinds do with the sky, would tell of a whole side, which the sun may lie on.
+_NEIGHBOURS, _FROM_AFAR = 8, 32
 _NORMAL_WEIGHT = calibration.number("inpaint.normal_weight")
 _TELLING = calibration.count("inpaint.telling")
 _TELLING_SHARE = calibration.number("inpaint.telling_share")
@@ -24,7 +27,7 @@ _ZERO = 1e-6
 # How much further off than the nearest a texel may lie that is taken for it, which halves the time.
 _SLACK = 0.25
 # Texels filled at a time, which bounds what their neighbours take.
-_AT_A_TIME = 1 << 18
+_AT_A_TIME = 1 << 16
 # How many times fewer sources each level has than the one before, and how many the last, at least.
 _COARSER, _FEWEST, _SEED = 4, 32, 0
 # Of more known texels than this in an object, evenly many are left out: among so many the nearest
@@ -41,10 +44,10 @@ def telling(num_texels: npt.ArrayLike) -> Double:
 def inpaint(texels: Texels, values: Float, known: Bool) -> Float:
     """Fill ``values`` (T, 3) where ``known`` (T,) is False; known ones are returned unchanged.
 
-    Geometric mean of 8 known texels of the same object that are near in position and normal: the
-    nearest ones, or for a texel at a distance evenly many over an area of about that size. An
-    object of which nothing is known takes the nearest known texels of the scene; a scene of which
-    nothing is known, or only black, becomes zero. Values in another unit give the same fill in that
+    Geometric mean of known texels of the same object that are near in position and normal: the 8
+    nearest ones, or for a texel at a distance 32, evenly over an area of about that size. An object
+    of which nothing is known takes the nearest known texels of the scene; a scene of which nothing
+    is known, or only black, becomes zero. Values in another unit give the same fill in that
     unit.
     """
     return inpaint_alike(texels, [values], known)[0]
@@ -75,6 +78,23 @@ def inpaint_alike(texels: Texels, maps: Sequence[Float], known: Bool) -> list[Fl
     return filled
 
 
+class _Sources(NamedTuple):
+    """Known texels (N,), and where they are."""
+
+    texel: Long
+    tree: cKDTree
+
+    @classmethod
+    def at(cls, texel: Long, places: Callable[[Long], Float]) -> _Sources:
+        return cls(texel, cKDTree(places(texel), balanced_tree=False, compact_nodes=False))
+
+    def near(self, places: Float, count: int) -> tuple[Double, Long]:
+        """Of each place the distance (M,) of the nearest, and as many of the nearest (M, k)."""
+        k = min(count, len(self.texel))
+        distance, nearest = self.tree.query(places, k=k, eps=_SLACK, workers=-1)
+        return distance.reshape(len(places), k)[:, 0], self.texel[nearest.reshape(len(places), k)]
+
+
 def _fill(
     texels: Texels,
     filled: Sequence[Float],
@@ -98,24 +118,21 @@ def _fill(
     counts = [len(source)]
     while counts[-1] > _COARSER * _FEWEST:
         counts.append(counts[-1] // _COARSER)
-    levels = [np.sort(mixed[:count]) for count in counts]
-    trees = [cKDTree(feature(own), balanced_tree=False, compact_nodes=False) for own in levels]
-    k = min(_NEIGHBOURS, len(source))
+    levels = [_Sources.at(np.sort(mixed[:count]), feature) for count in counts]
     for start in range(0, len(missing), _AT_A_TIME):
         some = missing[start : start + _AT_A_TIME]
         places = feature(some)
-        distance, nearest = trees[0].query(places, k=k, eps=_SLACK, workers=-1)
-        neighbours = source[nearest.reshape(len(some), k)]
-        # Sources in a circle around it with half the distance as its radius, for each of k.
-        many = np.pi / 4 / k * (distance.reshape(len(some), k)[:, 0] / max(spacing, 1e-30)) ** 2
+        distance, neighbours = levels[0].near(places, _NEIGHBOURS)
+        fills = [(some, neighbours)]
+        # Sources in a circle around it with half the distance as its radius, for each of its mean.
+        many = np.pi / 4 / _FROM_AFAR * (distance / max(spacing, 1e-30)) ** 2
         level = (np.log(np.maximum(many, 1)) / math.log(_COARSER)).astype(np.int64)
         level = np.minimum(level, len(levels) - 1)
-        for number in range(1, len(levels)):
-            own = np.flatnonzero(level == number)
+        for number, sources in enumerate(levels):
+            own = np.flatnonzero((many >= 1) & (level == number))
             if len(own):
-                _, nearest = trees[number].query(places[own], k=k, eps=_SLACK, workers=-1)
-                neighbours[own] = levels[number][nearest.reshape(len(own), k)]
+                fills.append((some[own], sources.near(places[own], _FROM_AFAR)[1]))
         for values, floor in zip(filled, floors, strict=True):
-            if floor > 0:
+            for own, neighbours in fills if floor > 0 else ():
                 logarithm = np.log(np.maximum(values[neighbours], floor))
-                values[some] = np.exp(logarithm.mean(axis=1))
+                values[own] = np.exp(logarithm.mean(axis=1))
