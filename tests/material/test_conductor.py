@@ -14,7 +14,7 @@ import pytest
 from usdbrdf.job.task import TaskRun
 from usdbrdf.job.units import HERE
 from usdbrdf.material import doubt_of_light, fit_objects, fit_views
-from usdbrdf.material.conductor import conductor_of
+from usdbrdf.material.conductor import Conductor, conductor_of
 from usdbrdf.material.fit_lobe import FittedKind
 from usdbrdf.material.fit_objects import (
     FirstLook,
@@ -422,3 +422,32 @@ def test_a_metal_competes_with_the_dielectric_of_the_fit(lobe: int, monkeypatch)
     first = LobeEstimate(PHI, 1.0, 0.02, 0.1, 0.0, 1.0, 0.9)
     fit_views.fit_views(lobe, lambda: sampled, 0, first)  # type: ignore[arg-type]
     assert asked["kinds"] == (None if lobe == PAPER else [lobe, lobe])
+
+
+def test_a_metal_that_is_found_is_held_against_more_rays(monkeypatch: pytest.MonkeyPatch):
+    """The product of what two noisy bases leave may by chance be next to nothing."""
+    metal, seeds, asked = Conductor(0.1, (0.5, 0.4, 0.3), 0.02, 0.03, 0.2), [], []
+
+    def basis(width: int, seed: int) -> Any:
+        seeds.append(seed)
+        return lambda kind, phis: (np.full((4, 3, 1), float(seed)), np.ones((4, 3, 1)))
+
+    def by_chance(*given: Any, **_: Any) -> Conductor | None:
+        asked.append([float(one([0.1])[0].mean()) for one in given[3]])
+        return metal if len(asked) == 1 else None
+
+    monkeypatch.setattr(fit_views, "conductor_of", by_chance)
+    samples = SimpleNamespace(radiance=None, texel=None)
+    sampled = SimpleNamespace(irradiance=1, samples=samples, basis=basis)
+    first = LobeEstimate(PHI, 1.0, 0.02, 0.1, 0.0, 1.0, 0.9)
+    assert fit_views.fit_views(DIELECTRIC, lambda: sampled, 7, first)[1] is None  # type: ignore[arg-type, return-value]
+    found, more = seeds[:2], seeds[2:]
+    assert found == [21, 22]
+    assert len(set(more)) == len(more) == 8
+    assert not set(more) & set(found)
+    assert asked[0] == found
+    assert asked[1] == pytest.approx([np.mean(more[:4]), np.mean(more[4:])])
+
+    asked.clear()
+    assert fit_views.fit_views(DIELECTRIC, lambda: sampled, 7, first, metal=True)[1] is metal  # type: ignore[arg-type, return-value]
+    assert len(asked) == 1

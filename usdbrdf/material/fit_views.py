@@ -57,7 +57,11 @@ _TIMES_FOR_CURVED = 2
 _CELL_PIXELS = calibration.number("fit.shared_error_size")
 # Of a refractive index of 1.5.
 _USUAL_PSI = USUAL_F0 / F0_OF_PSI
-_SEED_OF_THROUGH = 0x71E0
+_SEED_OF_THROUGH, _SEED_OF_METAL = 0x71E0, 0x3E7A
+# What a model leaves is the product of what two bases with noise of their own leave: where that is
+# much, it may happen to be next to nothing. A metal that is found is held against so many times the
+# rays.
+_MORE_FOR_METAL = 4
 
 
 class SampledPart(NamedTuple):
@@ -283,8 +287,8 @@ def fit_views(
     *,
     metal: bool = False,
 ) -> tuple[LobeEstimate, Conductor | None]:
-    """The lobe, of a kind (``brdf``), and the metal that explains the samples better, if one does;
-    where S is not known none is looked for.
+    """The lobe, of a kind (``brdf``), and the metal that explains the samples better, if one does,
+    with more rays as well; where S is not known none is looked for.
 
     sampled: asked for where something is left to be traced. first: the fit with the rays of
     ``first_seed(seed)``, if there is one. metal: it is known to be one.
@@ -299,17 +303,42 @@ def fit_views(
     explained = 1 - (1 - F0_OF_PSI) ** 2 if is_brightest else 1.0
     shows = found.evidence > explained * SOME_EVIDENCE
     bright = shows and found.psi + 2 * found.psi_error > 1
-    if not (bright or metal) or (irradiance := sampled().irradiance) is None:
+    if not (bright or metal) or sampled().irradiance is None:
         return found, None
-    samples = sampled().samples
-    one, other = (sampled().basis(0, own_seed) for own_seed in range(3 * seed, 3 * seed + 2))
-    kind = of_metal(lobe)
-    conductor = conductor_of(
-        samples.radiance, samples.texel, irradiance, (partial(one, kind), partial(other, kind)),
-        found, certain=metal,
+    conductor = _metal_of(lobe, sampled(), found, range(3 * seed, 3 * seed + 2), certain=metal)
+    if conductor and not metal:
+        first_of_more = 3 * (_SEED_OF_METAL + seed)
+        more = range(first_of_more, first_of_more + 2 * _MORE_FOR_METAL)
+        conductor = _metal_of(lobe, sampled(), found, more)
+    return found, conductor
+
+
+def _metal_of(
+    lobe: int,
+    held: SampledObject,
+    found: LobeEstimate,
+    seeds: Sequence[int],
+    *,
+    certain: bool = False,
+) -> Conductor | None:
+    """The metal that explains the samples better than the dielectric that was ``found``, if one
+    does, by two bases from the rays of half of the ``seeds`` each."""
+    assert held.irradiance is not None
+    samples, kind = held.samples, of_metal(lobe)
+    one, other = (_mean_of([held.basis(0, seed) for seed in seeds[half::2]]) for half in range(2))
+    return conductor_of(
+        samples.radiance, samples.texel, held.irradiance,
+        (partial(one, kind), partial(other, kind)), found, certain=certain,
         of_dielectric=None if kind == lobe else (partial(one, lobe), partial(other, lobe)),
     )  # fmt: skip
-    return found, conductor
+
+
+def _mean_of(bases: Sequence[Basis]) -> Basis:
+    def basis(kind: int, phis: Sequence[float]) -> tuple[Float, Float]:
+        of_base, of_slope = zip(*(one(kind, phis) for one in bases), strict=True)
+        return np.mean(of_base, axis=0), np.mean(of_slope, axis=0)
+
+    return bases[0] if len(bases) == 1 else basis
 
 
 def of_metal(lobe: int) -> int:
