@@ -134,5 +134,5 @@ def _fill(
                 fills.append((some[own], sources.near(places[own], _FROM_AFAR)[1]))
         for values, floor in zip(filled, floors, strict=True):
             for own, neighbours in fills if floor > 0 else ():
-                logarithm = np.log(np.maximum(values[neighbours], floor))
+                logarithm = np.log(np.maximum(values[neighbours], floor), dtype=np.float64)
                 values[own] = np.exp(logarithm.mean(axis=1))
