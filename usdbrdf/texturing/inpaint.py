@@ -123,13 +123,14 @@ def _fill(
         some = missing[start : start + _AT_A_TIME]
         places = feature(some)
         distance, neighbours = levels[0].near(places, _NEIGHBOURS)
-        fills = [(some, neighbours)]
         # Sources in a circle around it with half the distance as its radius, for each of its mean.
         many = np.pi / 4 / _FROM_AFAR * (distance / max(spacing, 1e-30)) ** 2
         level = (np.log(np.maximum(many, 1)) / math.log(_COARSER)).astype(np.int64)
         level = np.minimum(level, len(levels) - 1)
+        beside = many < 1
+        fills = [(some[beside], neighbours[beside])]
         for number, sources in enumerate(levels):
-            own = np.flatnonzero((many >= 1) & (level == number))
+            own = np.flatnonzero(~beside & (level == number))
             if len(own):
                 fills.append((some[own], sources.near(places[own], _FROM_AFAR)[1]))
         for values, floor in zip(filled, floors, strict=True):
